@@ -1,0 +1,42 @@
+# make quickstart   the whole pipeline on the built-in landmark (about 5 minutes on 2 cores)
+# make test         everything that a machine without a cluster can show
+# make check        the fast part, for every commit
+#
+# A laptop without a GPU: `make quickstart TORCH_INDEX=https://download.pytorch.org/whl/cpu` takes torch's small CPU build.
+
+PYTHON ?= python3
+TORCH_INDEX ?=
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: install quickstart test check lint format clean
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	    $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) --constraint constraints.txt --editable ".[dev]"
+	touch $(STAMP)
+
+quickstart: install
+	$(BIN)/crossray quickstart
+
+check: lint
+	$(BIN)/python -m pytest -q -m "not slow and not real and not cluster"
+
+test: install
+	$(BIN)/python -m pytest -q -m "not cluster"
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: install
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build *.egg-info
