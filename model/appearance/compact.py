@@ -1,0 +1,96 @@
+"""A small appearance branch for small pictures: bounded encoder, transform that starts as the identity.
+
+Same interface as the released one: T(F) = W F + b for each view, from explicit statistics. Two things differ, both from
+trouble seen with the released form on the fast field: embeddings pass through tanh, so that style cannot drown content,
+and T acts as a correction to F,
+
+    T(F) = F + U M_style M_content K (F - mu_cr) + v(mu_a),
+
+so that a view's own mean (which says more about how much sky it shows than about its light) stays in the picture.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from model.appearance.crossray import ContentStatistics, StyleStatistics
+
+GRID = 8  # cells a side of an embedding
+
+
+class CompactEncoder(nn.Module):
+    """Four strided convolutions and an average pool: images (P, 3, h, w) in [0, 1] -> F^a (P, C, 8, 8) in (-1, 1)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(3, 16, 3, stride=2, padding=1),
+            nn.LeakyReLU(0.2),
+            nn.Conv2d(16, 32, 3, stride=2, padding=1),
+            nn.LeakyReLU(0.2),
+            nn.Conv2d(32, 48, 3, stride=2, padding=1),
+            nn.LeakyReLU(0.2),
+            nn.AdaptiveAvgPool2d(GRID),
+            nn.Conv2d(48, channels, 1),
+            nn.Tanh(),
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        """F^a (P, C, 8, 8) of images (P, 3, h, w); colours enter centred."""
+        return self.layers(2 * image - 1)
+
+
+class CompactTransform(nn.Module):
+    """T from second moments of compressed features, near the identity at the start.
+
+    Args:
+        channels: C of a feature and of an embedding.
+        compressed: c, side of the matrices.
+    """
+
+    def __init__(self, channels: int, compressed: int = 16) -> None:
+        super().__init__()
+        self.compressed = compressed
+        self.compress = nn.Linear(channels, compressed, bias=False)
+        self.content = nn.Linear(channels, compressed)
+        self.style = nn.Linear(channels, compressed)
+        self.content_matrix = nn.Linear(compressed**2, compressed**2)
+        self.style_matrix = nn.Linear(compressed**2, compressed**2)
+        self.unzip = nn.Linear(compressed, channels, bias=False)
+        self.shift = nn.Sequential(nn.Linear(channels, 64), nn.LeakyReLU(0.2), nn.Linear(64, channels))
+        for layer in (self.content_matrix, self.style_matrix):
+            nn.init.normal_(layer.weight, std=0.1 / compressed)
+            nn.init.zeros_(layer.bias)
+        nn.init.normal_(self.unzip.weight, std=0.1 / compressed**0.5)
+
+    def content_statistics(self, features: Tensor) -> ContentStatistics:
+        """Mean (P, C) and second moment (P, c, c) of the features (P, N, C) of the rays at hand."""
+        mean = features.mean(dim=1)
+        z = self.content(features - mean[:, None])
+        return ContentStatistics(mean, z.transpose(1, 2) @ z / z.shape[1])
+
+    def style_statistics(self, embedding: Tensor) -> StyleStatistics:
+        """Mean (P, C) and second moment (P, c, c) of embeddings (P, C, h, w)."""
+        cells = embedding.flatten(2).transpose(1, 2)
+        mean = cells.mean(dim=1)
+        z = self.style(cells - mean[:, None])
+        return StyleStatistics(mean, z.transpose(1, 2) @ z / z.shape[1])
+
+    def affine(self, content: ContentStatistics, style: StyleStatistics) -> tuple[Tensor, Tensor]:
+        """W (P, C, C) and b (P, C) with T(F) = W F + b."""
+        product = self.matrix(self.style_matrix, style.gram) @ self.matrix(self.content_matrix, content.gram)
+        correction = self.unzip.weight @ product @ self.compress.weight
+        b = self.shift(style.mean) - (correction @ content.mean[..., None]).squeeze(-1)
+        return torch.eye(correction.shape[-1], device=b.device) + correction, b
+
+    def matrix(self, layer: nn.Linear, gram: Tensor) -> Tensor:
+        """I + FC(gram), (P, c, c)."""
+        c = self.compressed
+        return torch.eye(c, device=gram.device) + layer(gram.flatten(1)).view(-1, c, c)
+
+
+def at_size(images: list[Tensor], size: tuple[int, int]) -> Tensor:
+    """Images (3, h, w) of any size as one batch (P, 3, *size), area-averaged."""
+    return torch.cat([F.interpolate(image[None], size=size, mode="area") for image in images])

@@ -1,0 +1,63 @@
+"""The radiance field as one large MLP: position and direction -> density and features (released code)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from model.encoding import positional_encoding
+
+
+class RadianceMLP(nn.Module):
+    """NeRF's MLP whose head gives `out_channels` features in (0, 1) instead of a colour.
+
+    Appearance never enters: density and features are those of the place, and all conditioning comes after
+    rendering. With the defaults, 619,073 parameters. Weights start as torch's defaults, as in the released
+    code.
+    """
+
+    def __init__(
+        self,
+        out_channels: int = 64,
+        width: int = 256,
+        depth: int = 8,
+        skip: int = 4,
+        xyz_frequencies: int = 15,
+        dir_frequencies: int = 4,
+    ) -> None:
+        """`skip`: index of the layer that sees the encoded position once more, in front of its input."""
+        super().__init__()
+        self.xyz_frequencies, self.dir_frequencies, self.skip = xyz_frequencies, dir_frequencies, skip
+        xyz_channels = 3 * (1 + 2 * xyz_frequencies)
+        dir_channels = 3 * (1 + 2 * dir_frequencies)
+        inputs = [xyz_channels] + [width] * (depth - 1)
+        if 0 < skip < depth:
+            inputs[skip] += xyz_channels
+        self.layers = nn.ModuleList(nn.Linear(channels, width) for channels in inputs)
+        self.density = nn.Linear(width, 1)
+        self.bottleneck = nn.Linear(width, width)
+        self.directional = nn.Linear(width + dir_channels, width // 2)
+        self.head = nn.Linear(width // 2, out_channels)
+
+    def trunk(self, xyz: Tensor) -> Tensor:
+        """Position (..., 3) in scene units -> (..., width): what is known of a point from any direction."""
+        encoded = positional_encoding(xyz, self.xyz_frequencies)
+        h = encoded
+        for index, layer in enumerate(self.layers):
+            if index == self.skip and index > 0:
+                h = torch.cat([encoded, h], dim=-1)
+            h = torch.relu(layer(h))
+        return h
+
+    def forward(self, xyz: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Density (...,) > 0 in 1 / scene unit and features (..., out_channels) in (0, 1).
+
+        xyz: (..., 3). direction: unit, (..., 3), or anything that broadcasts: (R, 1, 3) serves all samples of
+        a ray.
+        """
+        h = self.trunk(xyz)
+        density = functional.softplus(self.density(h)).squeeze(-1)
+        encoded = positional_encoding(direction, self.dir_frequencies).expand(*h.shape[:-1], -1)
+        seen = torch.relu(self.directional(torch.cat([self.bottleneck(h), encoded], dim=-1)))
+        return density, torch.sigmoid(self.head(seen))

@@ -1,0 +1,97 @@
+"""What a rank sees in a step: the pixels and rays of its patches, and the photos that their appearance is read from."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.cameras import patch_grid, pixel_rays
+from model.fields.base import Rays
+from model.scene_model import Batch
+from pipeline.patches import Patch
+from pipeline.photos import Photos
+
+
+class TrainingPhotos:
+    """The training photos with their cameras on the training device; pixels stay in the mapped file.
+
+    Args:
+        photos: all photos of the scene.
+        device: where rays and colours go.
+        pixel_center: where in its pixel a ray goes through.
+    """
+
+    def __init__(self, photos: Photos, device: torch.device, pixel_center: float) -> None:
+        self.photos = photos
+        self.device = device
+        self.pixel_center = pixel_center
+        self.index = photos.indices("train")
+        records = [photos.records[i] for i in self.index]
+        self.sizes = np.array([(r.height, r.width) for r in records], dtype=np.int64)
+        self.intrinsics = torch.tensor([(r.fx, r.fy, r.cx, r.cy) for r in records], device=device)
+        self.c2w = torch.tensor([r.c2w for r in records], device=device)
+        self.bounds = torch.tensor([(r.near, r.far) for r in records], device=device)
+
+    def batch(self, patches: list[Patch], size: int) -> Batch:
+        """The pixels of `patches`, each a size x size grid."""
+        grids = [
+            patch_grid(size, p.scale, p.offset_h, p.offset_w, *(int(n) for n in self.sizes[p.photo]))
+            for p in patches
+        ]
+        rows = torch.stack([g[0] for g in grids])
+        cols = torch.stack([g[1] for g in grids])
+        colours = torch.stack(
+            [self.pixels(p.photo, r, c) for p, r, c in zip(patches, rows, cols, strict=True)]
+        )
+        height, width = torch.from_numpy(self.sizes[[p.photo for p in patches]]).float().t()
+        positions = torch.stack([(cols + 0.5) / width[:, None], (rows + 0.5) / height[:, None]], dim=-1)
+
+        chosen = [p.photo for p in patches]
+        origins, directions = pixel_rays(
+            cols.to(self.device),
+            rows.to(self.device),
+            self.intrinsics[chosen],
+            self.c2w[chosen],
+            self.pixel_center,
+        )
+        near, far = self.bounds[chosen][:, None].expand(-1, rows.shape[1], -1).unbind(-1)
+        rays = Rays(origins.flatten(0, 1), directions.flatten(0, 1), near.flatten(), far.flatten())
+        return Batch(
+            rays,
+            colours.to(self.device),
+            positions.to(self.device),
+            [self.reference(p.photo) for p in patches],
+            [self.reference(p.other) for p in patches],
+        )
+
+    def pixels(self, photo: int, rows: Tensor, cols: Tensor) -> Tensor:
+        """Colours (N, 3) in [0, 1] at rows and columns of one training photo."""
+        image = self.photos.image(self.index[photo])
+        return torch.from_numpy(image[rows.numpy(), cols.numpy()]).float() / 255
+
+    def reference(self, photo: int) -> Tensor:
+        """The appearance reference (3, h, w) in [0, 1] of one training photo."""
+        return as_tensor(self.photos.reference(self.index[photo]), self.device)
+
+
+def as_tensor(image: np.ndarray, device: torch.device) -> Tensor:
+    """A uint8 picture (h, w, 3) as (3, h, w) in [0, 1]."""
+    return torch.from_numpy(np.array(image)).to(device).permute(2, 0, 1).float() / 255
+
+
+def jitter_colours(batch: Batch, strength: float, generator: torch.Generator) -> Batch:
+    """Change each photo's exposure, white balance and contrast at random, in its patch and its reference alike.
+
+    A few dozen photos are few appearances for an encoder to learn from; these are more, and consistent.
+    """
+    count, device = len(batch.references), batch.colours.device
+    draws = strength * (2 * torch.rand(count, 5, device=device, generator=generator) - 1)
+    gain, gamma = torch.exp(draws[:, :1] + draws[:, 1:4]), torch.exp(draws[:, 4:])
+
+    def change(colours: Tensor, i: int, shape: tuple[int, ...]) -> Tensor:
+        return (colours.clamp(min=1e-3).pow(gamma[i]) * gain[i].view(shape)).clamp(0, 1)
+
+    colours = torch.stack([change(c, i, (1, 3)) for i, c in enumerate(batch.colours)])
+    references = [change(r, i, (3, 1, 1)) for i, r in enumerate(batch.references)]
+    return batch._replace(colours=colours, references=references)

@@ -1,0 +1,181 @@
+"""The command line. Stages are imported when their command runs, so that `--help` is quick and a machine without Ray
+or pycolmap can train from shards."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.table import Table
+
+from pipeline.errors import CrossrayError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Photos that strangers took of one place -> one radiance field without the tourists, in any appearance.",
+)
+
+Settings = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="Set a key of the job file.")]
+
+
+def main() -> None:
+    """Run a command; what the user has to put right is one message and exit status 2."""
+    set_up_logging()
+    try:
+        app()
+    except CrossrayError as error:
+        Console(stderr=True).print(f"[bold red]crossray:[/] {error}", highlight=False, soft_wrap=True, markup=True)
+        sys.exit(2)
+
+
+def set_up_logging() -> None:
+    """The project's log to the terminal; only rank 0 says what is not a warning."""
+    quiet = os.environ.get("RANK", "0") != "0"
+    handler = RichHandler(show_path=False, show_level=False, log_time_format="[%X]", console=Console(stderr=True))
+    logger = logging.getLogger("crossray")
+    logger.handlers[:] = [handler]
+    logger.setLevel(logging.WARNING if quiet else logging.INFO)
+    logger.propagate = False
+
+
+@app.command()
+def quickstart(
+    out: Annotated[Path, typer.Option(help="Folder for everything that is made.")] = Path("quickstart"),
+) -> None:
+    """The whole pipeline on the built-in landmark: photos, shards, training, evaluation, report."""
+    from pipeline.launch.local import run_local
+    from pipeline.launch.tasks import ray_tasks
+    from pipeline.quickstart import run_quickstart
+
+    run_quickstart(out, train=run_local, tasks=ray_tasks)
+
+
+@app.command()
+def run(
+    job: Annotated[Path, typer.Argument(help="A job file, for example jobs/train_scene.yaml.")],
+    settings: Settings = [],  # noqa: B006 (typer reads it once)
+    launcher: Annotated[str | None, typer.Option(help="local or torchrun; over the job's own.")] = None,
+) -> None:
+    """Run a job file: shards if they are absent, training, evaluation. Again: goes on from where it was."""
+    from pipeline.config import load_job
+    from pipeline.launch.run import run_job
+
+    extra = [f"launcher={launcher}"] if launcher else []
+    resolved = load_job(job, [*settings, *extra])
+    trained, evaluated = run_job(resolved)
+    if os.environ.get("RANK", "0") != "0":
+        return
+    state = "trained" if trained["finished"] else "stopped; run the same command again to go on"
+    print_line(f"{resolved.run}: {state}, {trained['steps']} steps in {trained['train_seconds']:.0f} s")
+    for result in evaluated:
+        print_scores(result)
+    print_line(f"TensorBoard: tensorboard --logdir {resolved.runs}")
+
+
+@app.command()
+def shard(
+    scene: Annotated[Path, typer.Argument(help="Folder of a posed scene.")],
+    out: Annotated[Path, typer.Option(help="Folder for the shards.")],
+    downscale: Annotated[int, typer.Option(min=1, help="Photos are reduced by this factor.")] = 2,
+    reference_downscale: Annotated[int, typer.Option(min=1, help="The encoder's references, by this factor.")] = 8,
+    list_patches: Annotated[int | None, typer.Option(metavar="EPOCH", help="Print an epoch's patch plan.")] = None,
+    ranks: Annotated[int, typer.Option(min=1, help="Ranks of the printed plan.")] = 1,
+    settings: Settings = [],  # noqa: B006
+) -> None:
+    """Cut a scene into webdataset tars, as Ray tasks. Keys to set: size, photos, min_scale, max_scale, seed."""
+    from pipeline.config import merge, parse_setting
+    from pipeline.launch.tasks import ray_tasks
+    from pipeline.patches import PatchPlan
+    from pipeline.shards import cut_shards
+
+    chosen: dict = {}
+    for setting in settings:
+        chosen = merge(chosen, parse_setting(setting))
+    try:
+        plan = PatchPlan(**chosen)
+    except ValueError as error:
+        raise CrossrayError(f"--set: {error}") from None
+    with ray_tasks() as mapper:
+        manifest = cut_shards(
+            scene, out, downscale=downscale, reference_downscale=reference_downscale, plan=plan, mapper=mapper
+        )
+    if list_patches is None:
+        size = sum(s.bytes for s in manifest.shards) / 1e6
+        print_line(f"{out}: {len(manifest.keys)} photos in {len(manifest.shards)} shards, {size:.1f} MB")
+        return
+    print_patches(out, plan, list_patches, ranks)
+
+
+def print_patches(folder: Path, plan: object, epoch: int, ranks: int) -> None:
+    """One line a patch: step, rank, photo, scale, offsets."""
+    from pipeline.patches import PatchPlan
+    from pipeline.patches import list_patches as rows_of
+    from pipeline.photos import open_photos
+
+    assert isinstance(plan, PatchPlan)
+    photos = open_photos(folder)
+    keys = [photos.records[i].key for i in photos.indices("train")]
+    sys.stdout.write("step\trank\tphoto\tscale\toffset_h\toffset_w\tother\n")
+    for row in rows_of(plan, keys, photos.sizes("train"), epoch, ranks):
+        sys.stdout.write("\t".join(f"{v:.6f}" if isinstance(v, float) else str(v) for v in row) + "\n")
+
+
+@app.command()
+def verify(folder: Annotated[Path, typer.Argument(help="Folder of shards.")]) -> None:
+    """Check every hash and every sample of a folder of shards."""
+    from pipeline.shards import verify_shards
+
+    manifest = verify_shards(folder)
+    print_line(f"{folder}: {len(manifest.shards)} shards, {len(manifest.keys)} photos, all as the manifest says")
+
+
+@app.command()
+def evaluate(
+    run: Annotated[Path, typer.Argument(help="Folder of a trained run.")],
+    protocol: Annotated[list[str], typer.Option(help="For example crnerf-full@R4; may be given several times.")],
+    step: Annotated[int | None, typer.Option(help="Checkpoint to evaluate; the newest by default.")] = None,
+) -> None:
+    """Score a run on its test photos under a protocol; metrics.json and pictures go to RUN/eval."""
+    from pipeline.evaluate import evaluate_run
+
+    for name in protocol:
+        print_scores(evaluate_run(run, name, step))
+
+
+@app.command()
+def methods() -> None:
+    """The methods: each is a point in one design space."""
+    from model.methods import METHODS
+
+    table = Table("method", "field", "colour", "appearance", "transient", "reproduces")
+    for name, method in METHODS.items():
+        table.add_row(name, method.field, method.colour, method.appearance, method.transient, method.reproduces)
+    Console().print(table)
+
+
+@app.command()
+def schema() -> None:
+    """JSON Schema of a job file, for editors."""
+    from pipeline.config import Job
+
+    sys.stdout.write(json.dumps(Job.model_json_schema(), indent=2) + "\n")
+
+
+def print_scores(result: dict) -> None:
+    """A protocol's means as one line."""
+    scores = "  ".join(f"{name.upper()} {value:.4g}" for name, value in result["mean"].items())
+    print_line(f"{result['protocol']} (step {result['step']}, {len(result['images'])} photos): {scores}")
+
+
+def print_line(text: str) -> None:
+    """A line of output."""
+    Console(highlight=False).print(text, soft_wrap=True, markup=False)

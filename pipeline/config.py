@@ -1,0 +1,282 @@
+"""The job file: its schema, its defaults, and how a key is set from the command line.
+
+Defaults depend on two things only: the method gives the four choices of the model, and the field (the paper's MLPs or
+the fast hash grid) gives the recipe that trains it. What a job file says wins over both, and `--set` over the file.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from model.losses import LossWeights
+from model.methods import METHODS, ModelSpec, check_spec
+from pipeline.errors import CrossrayError
+from pipeline.files import atomic_write
+from pipeline.patches import PatchPlan
+
+
+class JobError(CrossrayError):
+    """A job file that cannot be run: which key, why, and the nearest right value."""
+
+
+class Section(BaseModel):
+    """A part of a job file; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class SceneJob(Section):
+    """Which photos, at which size."""
+
+    path: Path
+    """Folder of the posed scene (Phototourism layout, or any COLMAP layout)."""
+    downscale: int = Field(2, ge=1)
+    """Photos are reduced by this factor: the paper's R/2 is 2, its R/4 is 4."""
+    reference_downscale: int = Field(8, ge=1)
+    """The appearance encoder and the segmenter see the original photo reduced by this factor."""
+    shards: Path | None = None
+    """Folder of the scene's shards; by default `shards/<scene>-R<downscale>` beside the runs."""
+
+
+class LearningRates(Section):
+    """Learning rates at the start of the decay, by part of the model."""
+
+    grid: float = Field(5e-4, gt=0)
+    """Hash tables."""
+    field: float = Field(5e-4, gt=0)
+    """Networks of the field, and the decoder."""
+    appearance: float = Field(5e-4, gt=0)
+    """Appearance encoder, content encoder, transform."""
+    transient: float = Field(5e-4, gt=0)
+    """Segmenter."""
+
+
+class TrainJob(Section):
+    """How long, how fast, and what is kept."""
+
+    epochs: int = Field(20, ge=1)
+    """Epochs; an epoch has `steps_per_epoch` steps."""
+    steps_per_epoch: int | Literal["auto"] = "auto"
+    """`auto`: training pixels / (rays a step x ranks), rounded down."""
+    seconds: float | None = Field(None, gt=0)
+    """Train for this many seconds instead of `epochs`; the schedule stretches to fit. Not repeatable to the bit."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """`auto`: bfloat16 inside the field where the hardware computes with it, else float32."""
+    learning_rates: LearningRates = LearningRates()
+    """By part of the model."""
+    adam_betas: tuple[float, float] = (0.9, 0.999)
+    """Adam's running-average coefficients."""
+    adam_epsilon: float = Field(1e-8, gt=0)
+    """Adam's epsilon."""
+    warmup_steps: int = Field(0, ge=0)
+    """Steps over which the learning rate rises from near zero."""
+    decay: Literal["cosine", "exponential"] = "cosine"
+    """`cosine`: to 1e-8, a step down each epoch (released code). `exponential`: from `decay_from` to `decay_floor`."""
+    decay_from: float = Field(0.5, ge=0, lt=1)
+    """Share of the training after which the exponential decay begins."""
+    decay_floor: float = Field(0.03, gt=0, le=1)
+    """Share of the learning rate that the exponential decay ends at."""
+    colour_jitter: float = Field(0.0, ge=0, lt=1)
+    """Strength of a random colour change applied to a photo and its reference alike: more appearances than photos."""
+    checkpoint_every: int = Field(5000, ge=1)
+    """Steps between checkpoints; the last step is always kept."""
+    keep_checkpoints: int = Field(5, ge=2)
+    """Newest checkpoints kept; older ones are removed."""
+    log_every: int = Field(100, ge=1)
+    """Steps between TensorBoard scalars."""
+    picture_every: int = Field(2000, ge=1)
+    """Steps between TensorBoard pictures of the fixed validation view."""
+
+
+class EvaluateJob(Section):
+    """What happens after training."""
+
+    protocols: tuple[str, ...] = ()
+    """Protocols to evaluate under, each with its downscale: `crnerf-full@R4`."""
+
+
+class Job(Section):
+    """A training job: shards if they are absent, trains, evaluates."""
+
+    kind: Literal["train"] = "train"
+    """What the job does."""
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)
+    """Name of the run: its folder is `<runs>/<name>`; running the job again goes on from its last checkpoint."""
+    method: str = "crnerf"
+    """A row of the table of methods (`crossray methods`)."""
+    scene: SceneJob
+    """Which photos, at which size."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    ranks: int = Field(1, ge=1)
+    """Processes that train together: one a GPU, or one a CPU core."""
+    launcher: Literal["local", "torchrun"] = "local"
+    """`local`: starts the ranks on this machine. `torchrun`: torchrun has started them."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """`auto`: CUDA where there is a GPU."""
+    threads: int = Field(1, ge=1)
+    """Torch threads a rank on CPU, whatever the launcher exports."""
+    model: ModelSpec = ModelSpec()
+    """What the model is made of."""
+    patch: PatchPlan = PatchPlan()
+    """What a rank sees in a step."""
+    losses: LossWeights = LossWeights()
+    """Weights of the loss terms."""
+    train: TrainJob = TrainJob()
+    """How long, how fast, and what is kept."""
+    evaluate: EvaluateJob = EvaluateJob()
+    """What happens after training."""
+
+    @property
+    def run(self) -> Path:
+        """The run's folder."""
+        return self.runs / self.name
+
+    @property
+    def shards(self) -> Path:
+        """The scene's shards at the job's downscale."""
+        scene = self.scene
+        return scene.shards or self.runs.parent / "shards" / f"{scene.path.resolve().name}-R{scene.downscale}"
+
+
+RECIPES: dict[str, dict[str, Any]] = {
+    "mlp": {},  # the paper's and the released code's values are the schema's defaults
+    "hash": {
+        "model": {"channels": 32, "encoder": "compact", "segmenter": "unet", "pixel_center": 0.5},
+        "patch": {"size": 12, "photos": 4},
+        "losses": {
+            "mask_start": 0.6,
+            "mask_end": 0.04,
+            "mask_decay": 0.007,
+            "appearance": 0.0,
+            "content": 0.0,
+        },
+        "train": {
+            "learning_rates": {"grid": 0.03, "field": 0.004, "appearance": 0.0012, "transient": 0.001},
+            "adam_betas": [0.9, 0.99],
+            "adam_epsilon": 1e-15,
+            "warmup_steps": 50,
+            "decay": "exponential",
+            "colour_jitter": 0.12,
+            "checkpoint_every": 1000,
+            "picture_every": 500,
+        },
+    },
+}
+
+
+def load_job(path: Path, settings: Sequence[str] = ()) -> Job:
+    """The job in a YAML file, with `key.sub=value` settings on top.
+
+    Raises:
+        JobError: the file, a key or a value is wrong; the message names it.
+    """
+    try:
+        raw = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise JobError(f"{path}: cannot be read ({error.strerror})") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise JobError(f"{path}: not a YAML file: {error}") from error
+    if not isinstance(raw, dict):
+        raise JobError(f"{path}: a job file is a mapping of keys to values, not {type(raw).__name__}")
+    return make_job(raw, settings, source=str(path))
+
+
+def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "job") -> Job:
+    """Like load_job, from a mapping."""
+    for setting in settings:
+        raw = merge(raw, parse_setting(setting))
+    try:
+        job = Job.model_validate(with_defaults(raw))
+        check_spec(job.model)
+    except ValidationError as error:
+        raise JobError("\n".join(f"{source}: {explain(e)}" for e in error.errors())) from None
+    except ValueError as error:
+        raise JobError(f"{source}: {error}") from None
+    return job
+
+
+def save_job(job: Job, path: Path) -> None:
+    """The resolved job: every key with its value."""
+    atomic_write(path, yaml.safe_dump(job.model_dump(mode="json"), sort_keys=False))
+
+
+def with_defaults(raw: dict[str, Any]) -> dict[str, Any]:
+    """`raw` over the recipe of its field over the choices of its method."""
+    name = raw.get("method", Job.model_fields["method"].default)
+    if name not in METHODS:
+        raise ValueError(f"method: {name!r} is not known{nearest(str(name), list(METHODS))}")
+    axes = METHODS[name].axes() | {
+        k: v for k, v in as_dict(raw.get("model")).items() if k in METHODS[name].axes()
+    }
+    recipe = RECIPES.get(str(axes["field"]), {})
+    if axes["appearance"] == "none":  # a changed colour could not be explained by anything
+        recipe = merge(recipe, {"train": {"colour_jitter": 0.0}})
+    return merge(merge(recipe, {"model": axes}), raw)
+
+
+def parse_setting(setting: str) -> dict[str, Any]:
+    """`a.b=c` -> {a: {b: c}}, with c read as YAML."""
+    key, equals, value = setting.partition("=")
+    if not equals or not key:
+        raise JobError(f"--set {setting}: write key=value, for example --set train.epochs=5")
+    try:
+        nested = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise JobError(f"--set {setting}: {value!r} is not YAML: {error}") from error
+    for part in reversed(key.strip().split(".")):
+        nested = {part: nested}
+    return nested
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`over` on top of `base`, mapping by mapping."""
+    merged = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = merge(merged[key], value) if both else value
+    return merged
+
+
+def as_dict(value: Any) -> dict[str, Any]:
+    """`value` if it is a mapping, else an empty one (the schema complains later)."""
+    return value if isinstance(value, dict) else {}
+
+
+def explain(error: Any) -> str:
+    """One pydantic error as `key: what is wrong, nearest right name`."""
+    location = [str(part) for part in error["loc"] if part not in ("int", "literal['auto']")]
+    key = ".".join(location)
+    if error["type"] == "extra_forbidden" or error["type"] == "unexpected_keyword_argument":
+        return f"{key}: there is no such key{nearest(location[-1], keys_at(location[:-1]))}"
+    if error["type"] == "missing":
+        return f"{key}: is missing"
+    return f"{key}: {error['msg'][:1].lower()}{error['msg'][1:]} (got {error['input']!r})"
+
+
+def keys_at(location: list[str]) -> list[str]:
+    """The valid keys of the section at `location`."""
+    schema = Job.model_json_schema()
+    node = schema
+    for part in location:
+        node = resolve(node.get("properties", {}).get(part, {}), schema)
+    return list(node.get("properties", {}))
+
+
+def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """Follow a JSON Schema reference."""
+    reference = node.get("$ref") or next((n["$ref"] for n in node.get("allOf", []) if "$ref" in n), None)
+    return schema["$defs"][reference.rsplit("/", 1)[-1]] if reference else node
+
+
+def nearest(name: str, valid: list[str]) -> str:
+    """`; did you mean x? (valid: ...)`."""
+    close = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    guess = f"; did you mean {close[0]!r}?" if close else ""
+    return f"{guess} (valid: {', '.join(valid)})" if valid else guess

@@ -1,0 +1,226 @@
+"""Scores of a trained run on its test photos, exactly as a protocol says.
+
+A protocol fixes everything that moves a number, and is always named with its downscale: `crnerf-full@R4`. Pictures and
+`metrics.json` go to `<run>/eval/<protocol>/step-<step>/`; metrics.json is written last.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import platform
+import re
+import time
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import yaml
+from PIL import Image
+from pydantic import BaseModel, ConfigDict
+
+from model.scene_model import SceneModel
+from pipeline.checkpoint import Checkpoint, CheckpointError, latest_checkpoint, read_checkpoint
+from pipeline.config import Job, load_job
+from pipeline.errors import CrossrayError
+from pipeline.files import atomic_file, atomic_write
+from pipeline.lpips import LPIPS, find_lpips
+from pipeline.metrics import psnr, ssim_11, ssim_window3, to_8bit
+from pipeline.photos import Photos, open_photos
+from pipeline.progress import Progress
+from pipeline.render import View, colour_view, read_appearance, render_view
+from pipeline.train import device_name
+
+log = logging.getLogger("crossray")
+
+AFFINE = "+affine"  # suffix of the control: colours fitted to the photo's left half by one affine map
+
+
+class Protocol(BaseModel):
+    """What is read, what is scored, and how (one file each in pipeline/protocols)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    appearance: Literal["whole", "left"]
+    scored: Literal["right", "whole"]
+    rounding: Literal["truncate", "round"]
+    ssim: Literal["window3", "window11"]
+    mlp_samples: tuple[int, int]
+
+
+def parse_protocol(name: str) -> tuple[Protocol, int, bool]:
+    """`crnerf-full@R4[+affine]` -> protocol, downscale, whether the affine control is asked for.
+
+    Raises:
+        CrossrayError: an unknown name, or one without its downscale.
+    """
+    known = sorted(
+        p.name.removesuffix(".yaml")
+        for p in files("pipeline.protocols").iterdir()
+        if p.name.endswith(".yaml")
+    )
+    match = re.fullmatch(r"([a-z0-9-]+)@R([1-9][0-9]*)(\+affine)?", name)
+    if match is None:
+        raise CrossrayError(
+            f"protocol {name!r}: write a protocol with its downscale, for example {known[0]}@R4 "
+            f"(known: {', '.join(known)}; a trailing {AFFINE} adds the affine control)"
+        )
+    if match[1] not in known:
+        raise CrossrayError(f"protocol {match[1]!r} is not known (known: {', '.join(known)})")
+    text = files("pipeline.protocols").joinpath(f"{match[1]}.yaml").read_text()
+    return Protocol.model_validate(yaml.safe_load(text)), int(match[2]), match[3] is not None
+
+
+def load_run(
+    run: Path, step: int | None = None, device: torch.device | None = None
+) -> tuple[Job, SceneModel, Checkpoint]:
+    """A run's job, its model in evaluation mode, and the checkpoint that it was read from (the newest, or `step`).
+
+    Raises:
+        CrossrayError: no such run, or no usable checkpoint in it.
+    """
+    if not (run / "job.yaml").is_file():
+        raise CrossrayError(f"{run} is not a run: it has no job.yaml")
+    job = load_job(run / "job.yaml").model_copy(
+        update={"runs": run.resolve().parent, "name": run.resolve().name}
+    )
+    if step is None:
+        checkpoint = latest_checkpoint(run / "checkpoints")
+        if checkpoint is None:
+            raise CheckpointError(
+                f"{run / 'checkpoints'}: no committed checkpoint; has the run been trained?"
+            )
+    else:
+        checkpoint = read_checkpoint(run / "checkpoints" / f"step-{step:08d}")
+    device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
+    model = SceneModel(job.model, torch.zeros(2, 3)).to(device)  # the scene's box is one of its buffers
+    model.load_state_dict(checkpoint.model)
+    return job, model.eval(), checkpoint
+
+
+def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict[str, Any]:
+    """Evaluate a run's checkpoint on its test photos; returns what metrics.json holds.
+
+    Raises:
+        CrossrayError: the run, the protocol or the shards cannot be used.
+    """
+    protocol, downscale, affine = parse_protocol(protocol_name)
+    job, model, checkpoint = load_run(run, step)
+    if downscale != job.scene.downscale:
+        raise CrossrayError(
+            f"protocol {protocol_name}: the run's shards {job.shards} are at R{job.scene.downscale}; "
+            f"evaluate under {protocol_name.split('@')[0]}@R{job.scene.downscale}, or train at R{downscale}"
+        )
+    torch.set_num_threads(max(job.threads, torch.get_num_threads()))
+    photos = open_photos(job.shards)
+    indices = photos.indices("test")
+    if not indices:
+        raise CrossrayError(
+            f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table"
+        )
+    out = run / "eval" / protocol_name / checkpoint.folder.name
+    lpips = find_lpips()
+    if lpips is None:
+        log.warning("LPIPS is left out: no weights found; CROSSRAY_LPIPS=/path/to/lpips_alex.npz names them")
+
+    began = time.perf_counter()
+    progress = Progress(f"evaluating {run.name} under {protocol_name}")
+    rows = []
+    for done, index in enumerate(indices):
+        view, picture = render_test_photo(model, photos, index, protocol)
+        if affine:
+            picture = fit_colours(picture, photos.image(index))
+        prediction = to_8bit(picture, protocol.rounding)
+        rows.append(score(prediction, photos, index, protocol, lpips))
+        save_png(out / f"{photos.records[index].key}.png", prediction)
+        save_png(out / f"{photos.records[index].key}.depth.png", depth_picture(view))
+        progress.update((done + 1) / len(indices), f"PSNR {np.mean([r['psnr'] for r in rows]):.2f}")
+    progress.close()
+    result = {
+        "protocol": protocol_name,
+        "definition": protocol.model_dump(mode="json"),
+        "step": checkpoint.step,
+        "checkpoint_sha256": checkpoint.meta["sha256"]["model.safetensors"],
+        "method": job.method,
+        "samples": list(samples_of(model, protocol) or ()) or "as in training",
+        "mean": {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k not in ("name", "key")},
+        "images": rows,
+        "seconds": time.perf_counter() - began,
+        "device": device_name(next(model.parameters()).device),
+        "versions": {p: importlib.metadata.version(p) for p in ("torch", "numpy", "pillow", "scikit-image")},
+        "python": platform.python_version(),
+    }
+    atomic_write(out / "metrics.json", json.dumps(result, indent=2))
+    return result
+
+
+def render_test_photo(
+    model: SceneModel, photos: Photos, index: int, protocol: Protocol
+) -> tuple[View, np.ndarray]:
+    """A photo's camera in the photo's own appearance, as far as the protocol lets the model see it."""
+    reference = photos.reference(index)
+    if protocol.appearance == "left":
+        reference = reference[:, : reference.shape[1] - reference.shape[1] // 2]
+    view = render_view(model, photos.records[index], samples=samples_of(model, protocol))
+    return view, colour_view(model, view, read_appearance(model, reference))
+
+
+def samples_of(model: SceneModel, protocol: Protocol) -> tuple[int, int] | None:
+    """Sample counts of the rendering; None keeps those of training (the protocols only speak of the MLP field)."""
+    return protocol.mlp_samples if model.spec.field == "mlp" else None
+
+
+def score(
+    prediction: np.ndarray, photos: Photos, index: int, protocol: Protocol, lpips: LPIPS | None
+) -> dict[str, Any]:
+    """The metrics of one 8-bit prediction."""
+    truth = photos.image(index)
+    start = truth.shape[1] // 2 if protocol.scored == "right" else 0
+    prediction, truth = np.ascontiguousarray(prediction[:, start:]), np.ascontiguousarray(truth[:, start:])
+    ssim = ssim_window3 if protocol.ssim == "window3" else ssim_11
+    row: dict[str, Any] = {
+        "name": photos.records[index].name,
+        "key": photos.records[index].key,
+        "psnr": psnr(prediction, truth),
+        "ssim": ssim(prediction, truth),
+    }
+    if lpips is not None:
+        row["lpips"] = lpips.distance(prediction, truth)
+    return row
+
+
+def fit_colours(picture: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """`picture` (h, w, 3) in [0, 1] through the affine colour map that fits the photo's left half best.
+
+    The honest control for every appearance model: least squares over the left half, 12 numbers, nothing learned.
+    """
+    left = photo.shape[1] - photo.shape[1] // 2
+    ones = np.ones((*picture.shape[:2], 1))
+    inputs = np.concatenate([picture, ones], axis=-1)
+    target = photo[:, :left].reshape(-1, 3) / 255
+    solution, *_ = np.linalg.lstsq(inputs[:, :left].reshape(-1, 4), target, rcond=None)
+    return np.clip(inputs @ solution, 0, 1)
+
+
+def depth_picture(view: View) -> np.ndarray:
+    """Depth as uint8 (h, w): near is bright, nothing is black."""
+    depth = view.depth / view.accumulation.clamp(min=1e-3)
+    near, far = torch.quantile(depth.flatten()[:1_000_000], torch.tensor([0.01, 0.99], device=depth.device))
+    bright = (
+        1 - 0.85 * ((depth - near) / (far - near).clamp(min=1e-6)).clamp(0, 1)
+    ) * view.accumulation.clamp(0, 1)
+    return (255 * bright).round().byte().cpu().numpy()
+
+
+def save_png(path: Path, picture: np.ndarray) -> None:
+    """A uint8 picture as PNG."""
+    with atomic_file(path) as file:
+        Image.fromarray(picture).save(file, format="PNG")
+
+
+def run_protocols(job: Job) -> list[dict[str, Any]]:
+    """Every protocol that the job asks for."""
+    return [evaluate_run(job.run, protocol) for protocol in job.evaluate.protocols]

@@ -1,0 +1,65 @@
+"""All ranks on this machine: one runs in this process, several are started by torch's own elastic launcher."""
+
+from __future__ import annotations
+
+import os
+import signal
+import uuid
+from typing import Any
+
+from pipeline.config import Job, save_job
+from pipeline.errors import CrossrayError
+from pipeline.launch.torchrun import StopFlag, pick_device, run_rank_of
+from pipeline.train import Context, train
+
+
+def run_local(job: Job) -> dict[str, Any]:
+    """Train with the job's ranks on this machine; returns rank 0's result.
+
+    Raises:
+        CrossrayError: a rank failed; its own message stands above.
+    """
+    if job.ranks == 1:
+        previous = signal.getsignal(signal.SIGTERM)
+        try:
+            return train(job, Context(device=pick_device(job, 0), should_stop=StopFlag().install()))
+        finally:
+            signal.signal(signal.SIGTERM, previous)
+    return run_ranks(job)
+
+
+def run_ranks(job: Job) -> dict[str, Any]:
+    """Several ranks as processes; if one fails, all are ended."""
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    pick_device(job, job.ranks - 1)  # refuse before anything is started
+    # A rank waiting for another one must not spin on the core that the other needs.
+    for name, value in (("OMP_NUM_THREADS", str(job.threads)), ("OMP_WAIT_POLICY", "PASSIVE")):
+        os.environ.setdefault(name, value)
+    os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
+    job_file = job.run / "job.yaml"
+    save_job(job, job_file)
+    config = LaunchConfig(
+        min_nodes=1,
+        max_nodes=1,
+        nproc_per_node=job.ranks,
+        run_id=uuid.uuid4().hex,
+        rdzv_backend="c10d",
+        rdzv_endpoint="127.0.0.1:0",
+        local_addr="127.0.0.1",
+        max_restarts=0,
+        monitor_interval=0.1,
+        start_method="spawn",
+    )
+    try:
+        return elastic_launch(config, run_rank_of)(str(job_file))[0]
+    except ChildFailedError as error:
+        rank, failure = error.get_first_failure()
+        raise CrossrayError(f"training stopped: rank {rank} failed: {first_line(failure.message)}") from None
+
+
+def first_line(message: Any) -> str:
+    """What went wrong, from an elastic failure record."""
+    text = message.get("message", "") if isinstance(message, dict) else str(message)
+    return text.strip().splitlines()[0] if text.strip() else "no message; see the log above"

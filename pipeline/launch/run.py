@@ -1,0 +1,105 @@
+"""A training job from its first stage to its last: shards if they are absent, training, evaluation."""
+
+from __future__ import annotations
+
+import logging
+import os
+from typing import Any
+
+import yaml
+from filelock import FileLock
+
+from pipeline.config import Job, save_job
+from pipeline.errors import CrossrayError
+from pipeline.evaluate import run_protocols
+from pipeline.launch.local import run_local
+from pipeline.launch.tasks import ray_tasks
+from pipeline.launch.torchrun import run_rank
+from pipeline.shards import Manifest, cut_shards, read_manifest
+
+log = logging.getLogger("crossray")
+
+# Keys that may change between two starts of one run: they decide where and when, not what comes out.
+FREE_KEYS = ("launcher", "device", "threads", "runs", "evaluate")
+
+
+def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Run a training job; a job that has run before goes on from where it was.
+
+    Returns:
+        What training.json holds, and what each protocol's metrics.json holds (empty on ranks other than 0).
+
+    Raises:
+        CrossrayError: anything that the user has to put right.
+    """
+    claim_run(job)
+    ensure_shards(job)
+    if job.launcher == "torchrun":
+        trained = run_rank(job)
+        if int(os.environ["RANK"]) != 0:
+            return trained, []
+    else:
+        trained = run_local(job)
+    return trained, run_protocols(job) if trained["finished"] else []
+
+
+def claim_run(job: Job) -> None:
+    """Record the resolved job in the run's folder.
+
+    Raises:
+        CrossrayError: the folder holds a run of another job; the message shows what differs.
+    """
+    path = job.run / "job.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(job.run / ".job.lock"):
+        if path.exists():
+            before = flatten(yaml.safe_load(path.read_text()))
+            now = flatten(job.model_dump(mode="json"))
+            differs = [
+                f"  {key}: {before.get(key)!r} -> {now.get(key)!r}"
+                for key in sorted(before.keys() | now.keys())
+                if before.get(key) != now.get(key) and key.split(".")[0] not in FREE_KEYS
+            ]
+            if differs:
+                raise CrossrayError(
+                    f"{job.run} holds a run of another job:\n" + "\n".join(differs) + "\n"
+                    "Choose another name (--set name=...), or remove that folder"
+                )
+        save_job(job, path)
+
+
+def flatten(mapping: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """{a: {b: c}} -> {"a.b": c}."""
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def ensure_shards(job: Job) -> Manifest:
+    """The job's shards, cut by Ray tasks if they are not there; Ray is gone when this returns.
+
+    Raises:
+        CrossrayError: the scene is missing, or the shards that are there are of another size.
+    """
+    folder, scene = job.shards, job.scene
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.parent / f".{folder.name}.lock"):
+        if not (folder / "manifest.json").is_file():
+            with ray_tasks() as mapper:
+                return cut_shards(
+                    scene.path,
+                    folder,
+                    downscale=scene.downscale,
+                    reference_downscale=scene.reference_downscale,
+                    plan=job.patch,
+                    mapper=mapper,
+                )
+    manifest = read_manifest(folder)
+    for key in ("downscale", "reference_downscale"):
+        if getattr(manifest, key) != getattr(scene, key):
+            raise CrossrayError(
+                f"scene.{key}: the job says {getattr(scene, key)}, but the shards in {folder} were cut with "
+                f"{getattr(manifest, key)}; --set scene.shards=FOLDER names other ones"
+            )
+    return manifest

@@ -1,0 +1,340 @@
+"""Reading posed scenes: a Phototourism download, or any COLMAP model beside its photos; with depth bounds.
+
+A scene folder holds photos (`dense/images` or `images`), a COLMAP model, text or binary (`sparse`,
+`sparse/0`, the same under `dense`, or the folder itself), and perhaps a NeRF-W split table (`*.tsv`).
+Undistorted pinhole cameras only.
+
+Notation: "COLMAP units" are the model's own lengths, "scene units" are COLMAP units / `Scene.scale`. Cameras
+are OpenCV camera-to-world, (3, 4). A photo's near and far are the 0.1 and 99.9 percentiles of the depth z of
+*all* points in front of it, and the scale makes the largest far of the scene 5, both as in the released code
+of CR-NeRF.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import CrossrayError
+
+SPLITS = ("train", "val", "test")
+MODEL_FILES = ("cameras", "images", "points3D")
+# Models whose parameters beyond focal lengths and centre are a distortion that vanishes at 0.
+PINHOLE_AT_ZERO = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+UNDISTORT = "undistort with `colmap image_undistorter` and read the scene that it makes"
+FAR = 5.0  # the largest far bound of a scene, in scene units
+
+log = logging.getLogger("crossray")
+
+
+class SceneError(CrossrayError):
+    """A scene folder that cannot be read as it is."""
+
+
+@dataclass(frozen=True)
+class ScenePhoto:
+    """One photo with its camera. Sizes and intrinsics are those of the photo at full size."""
+
+    name: str  # file name under the images folder, as in the COLMAP model
+    key: str  # unique, [a-z0-9_-] only; keys sort as photos do
+    image_id: int  # COLMAP's
+    split: str  # "train", "val" or "test"
+    path: Path
+    width: int
+    height: int
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels
+    c2w: np.ndarray  # (3, 4) float32, OpenCV camera-to-world, translation in scene units
+    near: float  # scene units
+    far: float  # scene units
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A posed scene: its photos sorted by name, in scene units."""
+
+    name: str
+    root: Path
+    photos: tuple[ScenePhoto, ...]
+    scale: float  # COLMAP units per scene unit
+    box: np.ndarray  # (2, 3) float32: 1st and 99th percentile of the points on each axis, scene units
+    num_points: int
+
+
+def read_scene(root: Path, name: str | None = None) -> Scene:
+    """Read the scene in the folder `root`; `name` is by default that of its tsv, else of the folder.
+
+    Photos that the split table lists and the model lacks are left out with a warning. Without a table, every
+    eighth photo in name order, from the first on, is a test photo.
+
+    Raises:
+        SceneError: no model, no photos, a camera that is not an undistorted pinhole, a degenerate model
+        (`check_model`),
+            several split tables, or a photo whose file is missing.
+    """
+    root = Path(root).resolve()
+    if not root.is_dir():
+        raise SceneError(f"{root}: no such folder; a scene is a folder with photos and a COLMAP model")
+    folder, model = find_model(root)
+    table = find_table(root)
+    by_name = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    if not by_name:
+        raise SceneError(f"{folder}: the COLMAP model has no registered photo")
+    splits = read_splits(table, by_name) if table else hold_out(by_name)
+    if not splits:
+        raise SceneError(f"{root}: no photo is left; {table} names none that the model in {folder} has")
+    if "train" not in splits.values():
+        raise SceneError(f"{root}: no training photo among the {len(splits)} posed ones; give some the split 'train'")
+    images = [by_name[n] for n in sorted(splits)]
+    check_model(model, images)
+    photo_folder = find_photo_folder(root, folder)
+    for image in images:
+        if not is_inside(photo_folder, image.name) or not (photo_folder / image.name).is_file():
+            raise SceneError(f"photo {image.name} of the model in {folder} is not in {photo_folder}")
+    return pose_photos(root, name or (table.stem if table else root.name), model, images, splits, photo_folder)
+
+
+def pose_photos(
+    root: Path, name: str, model: Any, images: list[Any], splits: dict[str, str], photo_folder: Path
+) -> Scene:
+    """The scene in scene units, from the model in COLMAP units."""
+    points = np.stack([p.xyz for p in model.points3D.values()])
+    poses = [image.cam_from_world().matrix() for image in images]
+    bounds = [depth_bounds(points, w2c, i.name) for w2c, i in zip(poses, images, strict=True)]
+    scale = float(np.float32(max(far for _, far in bounds)) / FAR)
+    photos = []
+    for i, (image, w2c, (near, far)) in enumerate(zip(images, poses, bounds, strict=True)):
+        camera = model.cameras[image.camera_id]
+        photos.append(
+            ScenePhoto(
+                name=image.name,
+                key=photo_key(i, image.name),
+                image_id=int(image.image_id),
+                split=splits[image.name],
+                path=photo_folder / image.name,
+                width=int(camera.width),
+                height=int(camera.height),
+                intrinsics=pinhole(camera, image),
+                c2w=camera_to_world(w2c, scale),
+                near=near / scale,
+                far=far / scale,
+            )
+        )
+    box = np.percentile(points / scale, [1, 99], axis=0).astype(np.float32)
+    return Scene(name, root, tuple(photos), scale, box, len(points))
+
+
+def depth_bounds(points: np.ndarray, w2c: np.ndarray, name: str) -> tuple[float, float]:
+    """The 0.1 and 99.9 percentiles of the depths z > 0 of `points` (P, 3) seen from `w2c` (3, 4), in COLMAP
+    units.
+    """
+    z = points @ w2c[2, :3] + w2c[2, 3]
+    z = z[z > 0]
+    if not len(z):
+        raise SceneError(f"photo {name} has every 3-D point behind it: its pose is wrong; take it out of the model")
+    near, far = np.percentile(z, [0.1, 99.9])
+    if not near < far:
+        raise SceneError(f"photo {name} has all 3-D points at one depth ({near:g}): too few points for bounds")
+    return float(near), float(far)
+
+
+def camera_to_world(w2c: np.ndarray, scale: float) -> np.ndarray:
+    """Invert a rigid world-to-camera (3, 4) and divide its centre by `scale`: (3, 4) float32."""
+    rotation = w2c[:, :3].T
+    return np.column_stack([rotation, -rotation @ w2c[:, 3] / scale]).astype(np.float32)
+
+
+def pinhole(camera: Any, image: Any) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a COLMAP camera without distortion."""
+    kind = camera.model.name
+    where = f"camera {image.camera_id} of photo {image.name}"
+    if kind not in PINHOLE_AT_ZERO:
+        raise SceneError(f"{where} is {kind}, not a pinhole: {UNDISTORT}")
+    distortion = [float(camera.params[i]) for i in camera.extra_params_idxs()]
+    if any(distortion):
+        values = ", ".join(f"{k:g}" for k in distortion)
+        raise SceneError(f"{where} is distorted (k={values}): {UNDISTORT}")
+    return (
+        float(camera.focal_length_x),
+        float(camera.focal_length_y),
+        float(camera.principal_point_x),
+        float(camera.principal_point_y),
+    )
+
+
+def photo_key(index: int, name: str) -> str:
+    """The key of photo number `index`: sorts as photos do, free of dots, which would end a webdataset key."""
+    slug = re.sub(r"[^a-z0-9_-]+", "-", Path(name).stem.lower())[:40]
+    return f"{index:06d}-{slug}"
+
+
+# Splits
+
+
+def find_table(root: Path) -> Path | None:
+    """The one split table of the scene: in `root`, else in `root/dense`."""
+    for folder in (root, root / "dense"):
+        tables = sorted(p for p in folder.glob("*.tsv") if not p.name.startswith("."))
+        if len(tables) > 1:
+            names = ", ".join(t.name for t in tables)
+            raise SceneError(f"{folder} has several split tables ({names}): keep the one to use")
+        if tables:
+            return tables[0]
+    return None
+
+
+def read_splits(table: Path, posed: dict[str, Any]) -> dict[str, str]:
+    """Photo name -> split, from NeRF-W's table, for the photos in `posed`.
+
+    Columns are found by name, for scenes differ in their order. Rows with an empty id were excluded by
+    NeRF-W's authors. The id itself is not used: photos are matched by name.
+    """
+    with table.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.DictReader(file, delimiter="\t")
+        lacking = {"filename", "id", "split"} - set(reader.fieldnames or ())
+        if lacking:
+            raise SceneError(
+                f"{table}: no column {', '.join(sorted(lacking))}; NeRF-W's tables have filename, id, split"
+            )
+        rows = [(number, row) for number, row in enumerate(reader, start=2)]
+    splits: dict[str, str] = {}
+    without_id = 0
+    for number, row in rows:
+        name, split = (row["filename"] or "").strip(), (row["split"] or "").strip()
+        if not (row["id"] or "").strip():
+            without_id += 1
+            continue
+        if split not in SPLITS:
+            raise SceneError(f"{table}, line {number}: split {split!r} of {name} is none of {', '.join(SPLITS)}")
+        if splits.setdefault(name, split) != split:
+            raise SceneError(f"{table}, line {number}: {name} is in {splits[name]} and in {split}; keep one row")
+    if without_id:
+        log.info("%s: %d rows without an id are left out", table.name, without_id)
+    absent = [name for name in splits if name not in posed]
+    if absent:
+        log.warning("%s: %d photos have no pose and are left out: %s", table.name, len(absent), ", ".join(absent))
+    unlisted = len(posed.keys() - splits.keys())
+    if unlisted:
+        log.info("%s: %d posed photos are not listed and are left out", table.name, unlisted)
+    return {name: split for name, split in splits.items() if name in posed}
+
+
+def hold_out(posed: dict[str, Any]) -> dict[str, str]:
+    """Photo name -> split where there is no table: every eighth photo in name order is for testing."""
+    splits = {name: "train" if i % 8 else "test" for i, name in enumerate(sorted(posed))}
+    tests = sum(s == "test" for s in splits.values())
+    log.info("no split table (*.tsv): every eighth photo is for testing, %d of %d", tests, len(splits))
+    return splits
+
+
+# Folders
+
+
+def find_model(root: Path) -> tuple[Path, Any]:
+    """The folder of the scene's COLMAP model and the model, a `pycolmap.Reconstruction`.
+
+    `dense` is looked into first: its model is the undistorted one. Of several beside each other, the one with
+    most photos.
+    """
+    import pycolmap
+
+    for base in (root / "dense" / "sparse", root / "sparse", root):
+        folders = [f for f in (base, *sorted(base.glob("[0-9]*"))) if holds_model(f)]
+        if not folders:
+            continue
+        models = []
+        for folder in folders:
+            try:
+                models.append((folder, pycolmap.Reconstruction(str(folder))))
+            except Exception as error:  # pycolmap raises whatever its C++ parser met: bad_alloc, map::at, ...
+                raise SceneError(
+                    f"{folder}: the COLMAP model cannot be read ({error}); is a file cut short?"
+                ) from error
+        folder, model = max(models, key=lambda pair: pair[1].num_reg_images())
+        if len(models) > 1:
+            counts = ", ".join(f"{f.relative_to(root)}: {m.num_reg_images()}" for f, m in models)
+            log.info("several COLMAP models (photos in each: %s); reading %s", counts, folder.relative_to(root))
+        return folder, model
+    raise SceneError(
+        f"{root}: no COLMAP model (cameras, images and points3D as .bin or .txt) in dense/sparse, sparse, "
+        "their numbered folders, or the folder itself"
+    )
+
+
+def holds_model(folder: Path) -> bool:
+    return any(all((folder / f"{stem}{suffix}").is_file() for stem in MODEL_FILES) for suffix in (".bin", ".txt"))
+
+
+def find_photo_folder(root: Path, model_folder: Path) -> Path:
+    """The photos that belong to the model: `dense/images` to one under `dense`, else `images`, else what
+    there is.
+    """
+    candidates = [root / "images", root / "dense" / "images"]
+    if (root / "dense") in model_folder.parents:
+        candidates.reverse()
+    for folder in candidates:
+        if folder.is_dir():
+            return folder
+    raise SceneError(f"{root}: no photos; expected a folder dense/images or images")
+
+
+def is_inside(folder: Path, name: str) -> bool:
+    return not Path(name).is_absolute() and (folder / name).resolve().is_relative_to(folder.resolve())
+
+
+# Health
+
+
+def check_model(model: Any, images: list[Any] | None = None) -> None:
+    """Refuse what structure from motion returns when it went wrong without saying so.
+
+    `model` is a `pycolmap.Reconstruction`, `images` those of its images that are to be used (all registered
+    ones by default). Such models have every photo registered and a reprojection error below a pixel, so
+    neither tells.
+
+    Raises:
+        SceneError: no 3-D points; a focal length outside 0.1 to 10 times the longer side; a photo that sees
+        no point; or
+            most cameras in one spot of a scene that is hundreds of times as large.
+    """
+    if images is None:
+        images = [model.images[i] for i in model.reg_image_ids()]
+    advice = "reconstruct again (another seed, or more photos), or leave the photo out"
+    if not model.points3D:
+        raise SceneError(f"the COLMAP model has no 3-D points: {advice}")
+    for image in images:
+        camera = model.cameras[image.camera_id]
+        for f in (camera.focal_length_x, camera.focal_length_y):
+            ratio = f / max(camera.width, camera.height)
+            if not 0.1 < ratio < 10:
+                raise SceneError(
+                    f"camera {image.camera_id} of photo {image.name} has a focal length of {ratio:.4g} times "
+                    f"its longer side (sane: 0.1 to 10): {advice}"
+                )
+        if image.num_points3D == 0:
+            raise SceneError(f"photo {image.name} is registered and sees no 3-D point: {advice}")
+    if is_collapsed(
+        np.stack([image.projection_center() for image in images]),
+        np.stack([point.xyz for point in model.points3D.values()]),
+    ):
+        raise SceneError(f"most of the {len(images)} cameras stand in one spot: {advice}")
+
+
+def is_collapsed(centres: np.ndarray, points: np.ndarray) -> bool:
+    """Whether at least half of the `centres` (N, 3) lie within 1/500 of the extent of the scene, in one spot.
+
+    The extent is the larger of the farthest centre and the median point (P, 3), from the median centre: a
+    collapsed model has one far outlier that stretches it, or no baseline at all. Real ones measured: 1/11 and
+    1/3; collapsed: below 1/1600.
+    """
+    if len(centres) < 2:
+        return False
+    middle = np.median(centres, axis=0)
+    from_middle = np.linalg.norm(centres - middle, axis=1)
+    extent = max(from_middle.max(), np.median(np.linalg.norm(points - middle, axis=1)))
+    return bool(np.median(from_middle) < extent / 500)

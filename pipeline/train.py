@@ -1,0 +1,413 @@
+"""The training loop.
+
+Each rank draws its own patches: what rank r sees in step s is a pure function of (seed, s, r), so a run can be stopped
+and resumed anywhere. DDP averages gradients over the ranks; rank 0 alone writes: TensorBoard, checkpoints, progress.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+from torch.utils.tensorboard import SummaryWriter
+
+from model.scene_model import SceneModel
+from pipeline.batches import TrainingPhotos, as_tensor, jitter_colours
+from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
+from pipeline.config import Job, TrainJob
+from pipeline.errors import CrossrayError
+from pipeline.files import atomic_write
+from pipeline.patches import patches, step_generator, steps_per_epoch
+from pipeline.photos import Photos, open_photos
+from pipeline.progress import Progress
+from pipeline.render import colour_view, read_appearance, render_view
+
+log = logging.getLogger("crossray")
+
+AGREE_EVERY = 10  # steps between the moments at which all ranks agree on time and on stopping
+PICTURE_SIDE = 160  # TensorBoard pictures are rendered at about this many pixels a side
+
+
+class TrainingError(CrossrayError):
+    """Training cannot go on."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a launcher tells a rank; the process group, if there are several ranks, is already there."""
+
+    rank: int = 0
+    world_size: int = 1
+    device: torch.device = torch.device("cpu")
+    should_stop: Callable[[], bool] = lambda: False
+
+
+@dataclass
+class Clock:
+    """How far training is: by steps, or by seconds where the job gives seconds."""
+
+    total_steps: int | None
+    total_seconds: float | None
+    step: int = 0
+    seconds: float = 0.0
+
+    @property
+    def progress(self) -> float:
+        """Share of the training that is done, in [0, 1]."""
+        if self.total_seconds is not None:
+            return min(self.seconds / self.total_seconds, 1.0)
+        assert self.total_steps is not None
+        return self.step / self.total_steps
+
+    @property
+    def done(self) -> bool:
+        """Whether no step is left."""
+        return self.progress >= 1
+
+
+def train(job: Job, context: Context) -> dict[str, Any]:
+    """Train until the job's end, or until the launcher asks to stop; returns what `training.json` of the run holds.
+
+    Resumes from the run's newest whole checkpoint.
+
+    Raises:
+        TrainingError: a loss that is not a finite number, or a checkpoint that is not this run's.
+    """
+    torch.set_num_threads(job.threads)
+    photos = open_photos(job.shards)
+    data = TrainingPhotos(photos, context.device, job.model.pixel_center)
+    epoch = epoch_length(job, data.sizes, context.world_size)
+    model = build_model(job, photos, context.device)
+    optimiser = build_optimiser(model, job.train)
+    seconds = job.train.seconds
+    clock = Clock(None if seconds else job.train.epochs * epoch, seconds)
+    identity = run_identity(job, photos)
+    ddp = distribute(model, context)
+    if context.world_size > 2:
+        warm_up(ddp, job, data, epoch, context)
+    resume(job, identity, model, optimiser, clock, context)
+
+    lead = context.rank == 0
+    writer = SummaryWriter(str(job.run / "tensorboard"), purge_step=clock.step) if lead else None
+    progress = Progress(f"training {job.name}", clock.progress, enabled=lead)
+    rays_a_step = job.patch.photos * job.patch.size**2 * context.world_size
+    last_saved, stopped = clock.step, False
+    last_log = (clock.step, time.perf_counter())
+    started = time.perf_counter() - clock.seconds
+    while not clock.done:
+        set_learning_rates(optimiser, job.train, clock)
+        terms, watched = training_step(ddp, optimiser, job, data, clock.step, epoch, context)
+        clock.step += 1
+
+        if clock.step % AGREE_EVERY == 0 or (clock.total_steps == clock.step):
+            stopped, clock.seconds = agree(context, time.perf_counter() - started)
+            progress.update(clock.progress, f"step {clock.step}  PSNR {psnr_of(watched['mse']):.1f}")
+        if clock.step % job.train.log_every == 0 or clock.done:
+            check_finite(terms, clock.step, data, job, epoch, context)
+            if writer is not None:
+                rate = (clock.step - last_log[0]) * rays_a_step / (time.perf_counter() - last_log[1])
+                write_scalars(writer, clock.step, terms, watched, optimiser, rate)
+                last_log = (clock.step, time.perf_counter())
+        if writer is not None and (clock.step % job.train.picture_every == 0 or clock.done):
+            write_pictures(writer, clock.step, model, photos)
+        if clock.done or stopped or clock.step % job.train.checkpoint_every == 0:
+            if lead and clock.step != last_saved:
+                meta = identity | {
+                    "seconds": clock.seconds,
+                    "finished": clock.done,
+                    "world_size": context.world_size,
+                }
+                save_checkpoint(
+                    checkpoints(job), clock.step, model.state_dict(), optimiser.state_dict(), meta
+                )
+                prune(checkpoints(job), job.train.keep_checkpoints)
+            last_saved = clock.step
+        if stopped:
+            break
+    progress.close()
+    if writer is not None:
+        writer.close()
+    result = {
+        "steps": clock.step,
+        "train_seconds": clock.seconds,
+        "ranks": context.world_size,
+        "finished": clock.done,
+        "steps_per_epoch": epoch,
+        "rays_a_step": rays_a_step,
+        "device": device_name(context.device),
+        "bfloat16": model.use_bfloat16,
+        "parameters": sum(p.numel() for p in model.parameters()),
+    }
+    if lead:
+        atomic_write(job.run / "training.json", json.dumps(result, indent=2))
+    return result
+
+
+def training_step(
+    ddp: torch.nn.Module,
+    optimiser: torch.optim.Optimizer,
+    job: Job,
+    data: TrainingPhotos,
+    step: int,
+    epoch: int,
+    context: Context,
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """One optimisation step; its draws depend on (seed, step, rank) alone."""
+    terms, watched = forward(ddp, job, data, step, epoch, context)
+    optimiser.zero_grad(set_to_none=True)
+    torch.stack(list(terms.values())).sum().backward()
+    optimiser.step()
+    return {k: v.detach() for k, v in terms.items()}, watched
+
+
+def forward(
+    ddp: torch.nn.Module, job: Job, data: TrainingPhotos, step: int, epoch: int, context: Context
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The loss terms of one step of this rank."""
+    chosen = patches(
+        job.patch,
+        data.sizes,
+        step=step,
+        rank=context.rank,
+        world_size=context.world_size,
+        steps_per_epoch=epoch,
+    )
+    generator = step_generator(job.patch.seed, step, context.rank, context.device)
+    batch = data.batch(chosen, job.patch.size)
+    if job.train.colour_jitter > 0:
+        batch = jitter_colours(batch, job.train.colour_jitter, generator)
+    return ddp(batch, step, generator, job.losses)
+
+
+# ------------------------------------------------------------------------------------------------------ set-up
+
+
+def build_model(job: Job, photos: Photos, device: torch.device) -> SceneModel:
+    """The job's model with its initial weights, which depend on the seed alone."""
+    torch.manual_seed(job.patch.seed)
+    model = SceneModel(job.model, torch.tensor(photos.manifest.scene.box)).to(device)
+    model.use_bfloat16 = uses_bfloat16(job.train, device)
+    return model
+
+
+def build_optimiser(model: SceneModel, train_job: TrainJob) -> torch.optim.Optimizer:
+    """Adam, with one learning rate a part of the model."""
+    rates = train_job.learning_rates
+    groups = [
+        {"params": parameters, "lr": getattr(rates, part), "base_lr": getattr(rates, part), "part": part}
+        for part, parameters in model.parameter_groups().items()
+    ]
+    return torch.optim.Adam(groups, betas=train_job.adam_betas, eps=train_job.adam_epsilon, fused=True)
+
+
+def distribute(model: SceneModel, context: Context) -> torch.nn.Module:
+    """DDP where there are several ranks."""
+    if context.world_size == 1:
+        return model
+    return DistributedDataParallel(
+        model, device_ids=[context.device.index] if context.device.type == "cuda" else None
+    )
+
+
+def warm_up(ddp: torch.nn.Module, job: Job, data: TrainingPhotos, epoch: int, context: Context) -> None:
+    """Two backward passes whose gradients are dropped.
+
+    DDP orders its buckets anew after the first one, and with more than two ranks the order of a sum changes its last
+    bits: a resumed run must start with the order that an undisturbed one has. Buffers are put back as they were.
+    """
+    before = {name: buffer.clone() for name, buffer in ddp.named_buffers()}
+    for _ in range(2):
+        terms, _ = forward(ddp, job, data, 0, epoch, context)
+        torch.stack(list(terms.values())).sum().backward()
+        ddp.zero_grad(set_to_none=True)
+    for name, buffer in ddp.named_buffers():
+        buffer.copy_(before[name])
+
+
+def epoch_length(job: Job, sizes: np.ndarray, world_size: int) -> int:
+    """Steps an epoch."""
+    if job.train.steps_per_epoch == "auto":
+        return steps_per_epoch(job.patch, sizes, world_size)
+    return job.train.steps_per_epoch
+
+
+def uses_bfloat16(train_job: TrainJob, device: torch.device) -> bool:
+    """Whether the field computes in bfloat16; `auto` asks the hardware (benchmarks/precision.py measures it)."""
+    if train_job.precision != "auto":
+        return train_job.precision == "bfloat16"
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    return bool(torch.cpu._is_avx512_bf16_supported())
+
+
+# ------------------------------------------------------------------------------------------------------ resume
+
+
+def checkpoints(job: Job) -> Path:
+    """The folder of the run's checkpoints."""
+    return job.run / "checkpoints"
+
+
+def run_identity(job: Job, photos: Photos) -> dict[str, str]:
+    """What must agree for a checkpoint to be this run's: the photos, and all of the job that enters the result."""
+    relevant = job.model_dump(mode="json", include={"method", "model", "patch", "losses", "train"})
+    text = json.dumps(relevant, sort_keys=True)
+    return {"shards": photos.manifest.content_hash, "job": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def resume(
+    job: Job,
+    identity: dict[str, str],
+    model: SceneModel,
+    optimiser: torch.optim.Optimizer,
+    clock: Clock,
+    context: Context,
+) -> None:
+    """Go on from the run's newest whole checkpoint, if there is one.
+
+    Raises:
+        TrainingError: the checkpoint belongs to other photos, another job, or another number of ranks.
+    """
+    checkpoint = latest_checkpoint(checkpoints(job))
+    if checkpoint is None:
+        return
+    expected = identity | {"world_size": context.world_size}
+    differs = [key for key, value in expected.items() if checkpoint.meta.get(key) != value]
+    if differs:
+        raise TrainingError(
+            f"{checkpoint.folder} was written with other {' and '.join(differs)}: it cannot be gone on from. "
+            f"Choose another name (--set name=...), or remove {job.run}"
+        )
+    model.load_state_dict(checkpoint.model)
+    optimiser.load_state_dict(checkpoint.optimiser())
+    clock.step, clock.seconds = checkpoint.step, float(checkpoint.meta["seconds"])
+    if context.rank == 0:
+        log.info("resuming %s from step %d", job.name, clock.step)
+
+
+# ---------------------------------------------------------------------------------------------------- schedule
+
+
+def set_learning_rates(optimiser: torch.optim.Optimizer, train_job: TrainJob, clock: Clock) -> None:
+    """The learning rate of each part at this moment."""
+    for group in optimiser.param_groups:
+        group["lr"] = learning_rate(group["base_lr"], train_job, clock.step, clock.progress)
+
+
+def learning_rate(base: float, train_job: TrainJob, step: int, progress: float) -> float:
+    """`base` after warm-up and decay at `step`, when `progress` in [0, 1] of the training is done."""
+    rate = base * min(1.0, (step + 1) / (train_job.warmup_steps + 1))
+    if train_job.decay == "cosine":
+        epoch = math.floor(progress * train_job.epochs + 1e-9)  # released code: constant inside an epoch
+        low = 1e-8
+        return low + (rate - low) * 0.5 * (1 + math.cos(math.pi * epoch / train_job.epochs))
+    late = max(0.0, (progress - train_job.decay_from) / (1 - train_job.decay_from))
+    return rate * train_job.decay_floor**late
+
+
+def agree(context: Context, seconds: float) -> tuple[bool, float]:
+    """All ranks take rank 0's clock, and stop if any of them was asked to."""
+    if context.world_size == 1:
+        return context.should_stop(), seconds
+    shared = torch.tensor(
+        [float(context.should_stop()), seconds if context.rank == 0 else 0.0], dtype=torch.float64
+    )
+    shared = shared.to(context.device)
+    dist.all_reduce(shared)
+    return bool(shared[0] > 0), float(shared[1])
+
+
+def check_finite(
+    terms: dict[str, Tensor], step: int, data: TrainingPhotos, job: Job, epoch: int, context: Context
+) -> None:
+    """Stop before a loss that is not finite reaches a checkpoint."""
+    bad = [name for name, value in terms.items() if not math.isfinite(float(value))]
+    if bad:
+        chosen = patches(
+            job.patch,
+            data.sizes,
+            step=step - 1,
+            rank=context.rank,
+            world_size=context.world_size,
+            steps_per_epoch=epoch,
+        )
+        names = sorted({data.photos.records[data.index[p.photo]].name for p in chosen})
+        raise TrainingError(
+            f"step {step - 1}: the loss {', '.join(bad)} is not a finite number (photos {', '.join(names)}). "
+            f"The last good checkpoint is in {checkpoints(job)}; a lower learning rate is the usual cure"
+        )
+
+
+# ------------------------------------------------------------------------------------------------- TensorBoard
+
+
+def psnr_of(mse: Tensor | float) -> float:
+    """-10 log10 of a mean squared error."""
+    return -10 * math.log10(max(float(mse), 1e-10))
+
+
+def write_scalars(
+    writer: SummaryWriter,
+    step: int,
+    terms: dict[str, Tensor],
+    watched: dict[str, Tensor],
+    optimiser: torch.optim.Optimizer,
+    rays_per_second: float,
+) -> None:
+    """Every loss term, what is watched, speed, learning rates, memory."""
+    for name, value in terms.items():
+        writer.add_scalar(f"loss/{name}", float(value), step)
+    writer.add_scalar("loss/total", float(sum(terms.values())), step)
+    writer.add_scalar("train/psnr", psnr_of(watched["mse"]), step)
+    if "mask" in watched:
+        writer.add_scalar("train/mask_share", float(watched["mask"]), step)
+    for group in optimiser.param_groups:
+        writer.add_scalar(f"learning_rate/{group['part']}", group["lr"], step)
+    writer.add_scalar("speed/rays_per_second", rays_per_second, step)
+    writer.add_scalar("memory/resident_MiB", psutil.Process().memory_info().rss / 2**20, step)
+    if torch.cuda.is_available():
+        writer.add_scalar("memory/gpu_peak_MiB", torch.cuda.max_memory_allocated() / 2**20, step)
+
+
+def write_pictures(writer: SummaryWriter, step: int, model: SceneModel, photos: Photos) -> None:
+    """A fixed validation view (a training view where there is no other) with its PSNR, depth, and mask."""
+    index = (photos.indices("val") or photos.indices("train"))[0]
+    camera = photos.records[index]
+    stride = max(1, round(max(camera.width, camera.height) / PICTURE_SIDE))
+    model.eval()
+    view = render_view(model, camera, stride=stride)
+    picture = colour_view(model, view, read_appearance(model, photos.reference(index)))
+    photo = photos.image(index)[stride // 2 :: stride, stride // 2 :: stride] / 255
+    writer.add_image("view/rendered", picture, step, dataformats="HWC")
+    writer.add_image("view/photo", photo, step, dataformats="HWC")
+    depth = (view.depth / view.depth.max().clamp(min=1e-6)).cpu().numpy()
+    writer.add_image("view/depth", depth, step, dataformats="HW")
+    writer.add_scalar("view/psnr", psnr_of(float(np.square(picture - photo).mean())), step)
+    if model.segmenter is not None:
+        reference = as_tensor(photos.reference(index), view.depth.device)
+        mask = model.transient_mask(reference, view.size).cpu().numpy()
+        writer.add_image("view/mask", mask, step, dataformats="HW")
+    model.train()
+
+
+def device_name(device: torch.device) -> str:
+    """The device as its maker calls it."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
+    return "cpu"
