@@ -47,7 +47,8 @@ class Batch(NamedTuple):
     rays: Rays  # P N rays, patch by patch
     colours: Tensor  # (P, N, 3) in [0, 1]
     positions: Tensor  # (P, N, 2): (x, y) of the pixel's middle in its photo, in (0, 1)
-    references: list[Tensor]  # P photos (3, h, w) in [0, 1], as the encoder and the segmenter see them
+    references: list[Tensor]  # P photos (3, h, w) in [0, 1], as the segmenter sees them
+    appearances: list[Tensor]  # the same photos, or parts of them, as the encoder sees them
     others: list[Tensor]  # P random other photos, for the appearance loss
 
 
@@ -122,7 +123,7 @@ class SceneModel(nn.Module):
 
         embedding = None
         if self.encoder is not None:
-            embedding = self.encode(batch.references)
+            embedding = self.encode(batch.appearances)
             self.track(features[-1])
             terms["embedding"] = weights.embedding * embedding_size(embedding)
         pictures = [self.colours(f, embedding) for f in features]

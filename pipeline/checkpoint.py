@@ -57,9 +57,7 @@ def save_checkpoint(
     (target / META).unlink(missing_ok=True)  # an older try at the same step must not vouch for new files
     buffer = io.BytesIO()
     torch.save(optimiser, buffer)
-    atomic_write(
-        target / MODEL, save_safetensors({k: v.detach().cpu().contiguous() for k, v in model.items()})
-    )
+    atomic_write(target / MODEL, save_safetensors({k: v.detach().cpu().contiguous() for k, v in model.items()}))
     atomic_write(target / TRAINING, buffer.getvalue())
     record = {"format": FORMAT, "step": step, **meta}
     record["sha256"] = {name: sha256_of(target / name) for name in (MODEL, TRAINING)}

@@ -84,6 +84,8 @@ class TrainJob(Section):
     """Share of the learning rate that the exponential decay ends at."""
     colour_jitter: float = Field(0.0, ge=0, lt=1)
     """Strength of a random colour change applied to a photo and its reference alike: more appearances than photos."""
+    reference_crop: float = Field(1.0, gt=0, le=1)
+    """Smallest share of a reference's sides that the encoder sees in training; 1 shows it the whole photo."""
     checkpoint_every: int = Field(5000, ge=1)
     """Steps between checkpoints; the last step is always kept."""
     keep_checkpoints: int = Field(5, ge=2)
@@ -212,9 +214,7 @@ def with_defaults(raw: dict[str, Any]) -> dict[str, Any]:
     name = raw.get("method", Job.model_fields["method"].default)
     if name not in METHODS:
         raise ValueError(f"method: {name!r} is not known{nearest(str(name), list(METHODS))}")
-    axes = METHODS[name].axes() | {
-        k: v for k, v in as_dict(raw.get("model")).items() if k in METHODS[name].axes()
-    }
+    axes = METHODS[name].axes() | {k: v for k, v in as_dict(raw.get("model")).items() if k in METHODS[name].axes()}
     recipe = RECIPES.get(str(axes["field"]), {})
     if axes["appearance"] == "none":  # a changed colour could not be explained by anything
         recipe = merge(recipe, {"train": {"colour_jitter": 0.0}})

@@ -58,9 +58,7 @@ def parse_protocol(name: str) -> tuple[Protocol, int, bool]:
         CrossrayError: an unknown name, or one without its downscale.
     """
     known = sorted(
-        p.name.removesuffix(".yaml")
-        for p in files("pipeline.protocols").iterdir()
-        if p.name.endswith(".yaml")
+        p.name.removesuffix(".yaml") for p in files("pipeline.protocols").iterdir() if p.name.endswith(".yaml")
     )
     match = re.fullmatch(r"([a-z0-9-]+)@R([1-9][0-9]*)(\+affine)?", name)
     if match is None:
@@ -84,15 +82,11 @@ def load_run(
     """
     if not (run / "job.yaml").is_file():
         raise CrossrayError(f"{run} is not a run: it has no job.yaml")
-    job = load_job(run / "job.yaml").model_copy(
-        update={"runs": run.resolve().parent, "name": run.resolve().name}
-    )
+    job = load_job(run / "job.yaml").model_copy(update={"runs": run.resolve().parent, "name": run.resolve().name})
     if step is None:
         checkpoint = latest_checkpoint(run / "checkpoints")
         if checkpoint is None:
-            raise CheckpointError(
-                f"{run / 'checkpoints'}: no committed checkpoint; has the run been trained?"
-            )
+            raise CheckpointError(f"{run / 'checkpoints'}: no committed checkpoint; has the run been trained?")
     else:
         checkpoint = read_checkpoint(run / "checkpoints" / f"step-{step:08d}")
     device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
@@ -118,9 +112,7 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
     photos = open_photos(job.shards)
     indices = photos.indices("test")
     if not indices:
-        raise CrossrayError(
-            f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table"
-        )
+        raise CrossrayError(f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table")
     out = run / "eval" / protocol_name / checkpoint.folder.name
     lpips = find_lpips()
     if lpips is None:
@@ -157,9 +149,7 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
     return result
 
 
-def render_test_photo(
-    model: SceneModel, photos: Photos, index: int, protocol: Protocol
-) -> tuple[View, np.ndarray]:
+def render_test_photo(model: SceneModel, photos: Photos, index: int, protocol: Protocol) -> tuple[View, np.ndarray]:
     """A photo's camera in the photo's own appearance, as far as the protocol lets the model see it."""
     reference = photos.reference(index)
     if protocol.appearance == "left":
@@ -209,9 +199,7 @@ def depth_picture(view: View) -> np.ndarray:
     """Depth as uint8 (h, w): near is bright, nothing is black."""
     depth = view.depth / view.accumulation.clamp(min=1e-3)
     near, far = torch.quantile(depth.flatten()[:1_000_000], torch.tensor([0.01, 0.99], device=depth.device))
-    bright = (
-        1 - 0.85 * ((depth - near) / (far - near).clamp(min=1e-6)).clamp(0, 1)
-    ) * view.accumulation.clamp(0, 1)
+    bright = (1 - 0.85 * ((depth - near) / (far - near).clamp(min=1e-6)).clamp(0, 1)) * view.accumulation.clamp(0, 1)
     return (255 * bright).round().byte().cpu().numpy()
 
 

@@ -35,9 +35,7 @@ def view_rays(camera: CameraRecord, pixel_center: float, device: torch.device, s
     c2w = torch.tensor(camera.c2w, device=device)
     origins, directions = pixel_rays(cols.flatten(), rows.flatten(), intrinsics, c2w, pixel_center)
     count = len(origins)
-    return Rays(
-        origins, directions, origins.new_full((count,), camera.near), origins.new_full((count,), camera.far)
-    )
+    return Rays(origins, directions, origins.new_full((count,), camera.near), origins.new_full((count,), camera.far))
 
 
 def render_view(

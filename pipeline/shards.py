@@ -19,7 +19,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import logging
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -49,8 +48,6 @@ Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Key = Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
 Mapper = Callable[[Callable[["ShardSpec"], "ShardInfo"], list["ShardSpec"]], Iterable["ShardInfo"]]
-
-log = logging.getLogger("crossray")
 
 
 class ShardError(CrossrayError):

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 import torch.distributed as dist
 from torch import Tensor
@@ -25,7 +24,8 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
 from model.scene_model import SceneModel
-from pipeline.batches import TrainingPhotos, as_tensor, jitter_colours
+from pipeline.batches import TrainingPhotos, augment
+from pipeline.board import psnr_of, write_pictures, write_scalars
 from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
 from pipeline.config import Job, TrainJob
 from pipeline.errors import CrossrayError
@@ -33,12 +33,11 @@ from pipeline.files import atomic_write
 from pipeline.patches import patches, step_generator, steps_per_epoch
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
-from pipeline.render import colour_view, read_appearance, render_view
 
 log = logging.getLogger("crossray")
 
+AUGMENTATION = 4  # keeps these draws apart from those of the patches
 AGREE_EVERY = 10  # steps between the moments at which all ranks agree on time and on stopping
-PICTURE_SIDE = 160  # TensorBoard pictures are rendered at about this many pixels a side
 
 
 class TrainingError(CrossrayError):
@@ -115,24 +114,24 @@ def train(job: Job, context: Context) -> dict[str, Any]:
         if clock.step % AGREE_EVERY == 0 or (clock.total_steps == clock.step):
             stopped, clock.seconds = agree(context, time.perf_counter() - started)
             progress.update(clock.progress, f"step {clock.step}  PSNR {psnr_of(watched['mse']):.1f}")
-        if clock.step % job.train.log_every == 0 or clock.done:
-            check_finite(terms, clock.step, data, job, epoch, context)
-            if writer is not None:
-                rate = (clock.step - last_log[0]) * rays_a_step / (time.perf_counter() - last_log[1])
-                write_scalars(writer, clock.step, terms, watched, optimiser, rate)
-                last_log = (clock.step, time.perf_counter())
+        save_now = clock.done or stopped or clock.step % job.train.checkpoint_every == 0
+        log_now = clock.done or clock.step % job.train.log_every == 0
+        if save_now or log_now:
+            check_finite(terms, model, clock.step, data, job, epoch, context)
+        if writer is not None and log_now:
+            rate = (clock.step - last_log[0]) * rays_a_step / (time.perf_counter() - last_log[1])
+            write_scalars(writer, clock.step, terms, watched, optimiser, rate)
+            last_log = (clock.step, time.perf_counter())
         if writer is not None and (clock.step % job.train.picture_every == 0 or clock.done):
             write_pictures(writer, clock.step, model, photos)
-        if clock.done or stopped or clock.step % job.train.checkpoint_every == 0:
+        if save_now:
             if lead and clock.step != last_saved:
                 meta = identity | {
                     "seconds": clock.seconds,
                     "finished": clock.done,
                     "world_size": context.world_size,
                 }
-                save_checkpoint(
-                    checkpoints(job), clock.step, model.state_dict(), optimiser.state_dict(), meta
-                )
+                save_checkpoint(checkpoints(job), clock.step, model.state_dict(), optimiser.state_dict(), meta)
                 prune(checkpoints(job), job.train.keep_checkpoints)
             last_saved = clock.step
         if stopped:
@@ -187,8 +186,9 @@ def forward(
     )
     generator = step_generator(job.patch.seed, step, context.rank, context.device)
     batch = data.batch(chosen, job.patch.size)
-    if job.train.colour_jitter > 0:
-        batch = jitter_colours(batch, job.train.colour_jitter, generator)
+    if job.train.colour_jitter > 0 or job.train.reference_crop < 1:
+        rng = np.random.default_rng((AUGMENTATION, job.patch.seed, step, context.rank))
+        batch = augment(batch, job.train.colour_jitter, job.train.reference_crop, rng)
     return ddp(batch, step, generator, job.losses)
 
 
@@ -199,7 +199,7 @@ def build_model(job: Job, photos: Photos, device: torch.device) -> SceneModel:
     """The job's model with its initial weights, which depend on the seed alone."""
     torch.manual_seed(job.patch.seed)
     model = SceneModel(job.model, torch.tensor(photos.manifest.scene.box)).to(device)
-    model.use_bfloat16 = uses_bfloat16(job.train, device)
+    model.use_bfloat16 = uses_bfloat16(job, device)
     return model
 
 
@@ -214,12 +214,12 @@ def build_optimiser(model: SceneModel, train_job: TrainJob) -> torch.optim.Optim
 
 
 def distribute(model: SceneModel, context: Context) -> torch.nn.Module:
-    """DDP where there are several ranks."""
+    """DDP where there are several ranks. Buffers (running averages) never enter a gradient, so rank 0's are as good as
+    any and need not travel."""
     if context.world_size == 1:
         return model
-    return DistributedDataParallel(
-        model, device_ids=[context.device.index] if context.device.type == "cuda" else None
-    )
+    devices = [context.device.index] if context.device.type == "cuda" else None
+    return DistributedDataParallel(model, device_ids=devices, broadcast_buffers=False)
 
 
 def warm_up(ddp: torch.nn.Module, job: Job, data: TrainingPhotos, epoch: int, context: Context) -> None:
@@ -244,13 +244,14 @@ def epoch_length(job: Job, sizes: np.ndarray, world_size: int) -> int:
     return job.train.steps_per_epoch
 
 
-def uses_bfloat16(train_job: TrainJob, device: torch.device) -> bool:
-    """Whether the field computes in bfloat16; `auto` asks the hardware (benchmarks/precision.py measures it)."""
-    if train_job.precision != "auto":
-        return train_job.precision == "bfloat16"
+def uses_bfloat16(job: Job, device: torch.device) -> bool:
+    """Whether the field computes in bfloat16. `auto`: on GPUs that have it; on CPUs with bfloat16 instructions for the
+    big MLPs of the paper, but not for the small ones of the fast field, where it was measured to gain nothing."""
+    if job.train.precision != "auto":
+        return job.train.precision == "bfloat16"
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    return bool(torch.cpu._is_avx512_bf16_supported())
+    return job.model.field == "mlp" and bool(torch.cpu._is_avx512_bf16_supported())
 
 
 # ------------------------------------------------------------------------------------------------------ resume
@@ -322,85 +323,34 @@ def agree(context: Context, seconds: float) -> tuple[bool, float]:
     """All ranks take rank 0's clock, and stop if any of them was asked to."""
     if context.world_size == 1:
         return context.should_stop(), seconds
-    shared = torch.tensor(
-        [float(context.should_stop()), seconds if context.rank == 0 else 0.0], dtype=torch.float64
-    )
+    shared = torch.tensor([float(context.should_stop()), seconds if context.rank == 0 else 0.0], dtype=torch.float64)
     shared = shared.to(context.device)
     dist.all_reduce(shared)
     return bool(shared[0] > 0), float(shared[1])
 
 
 def check_finite(
-    terms: dict[str, Tensor], step: int, data: TrainingPhotos, job: Job, epoch: int, context: Context
+    terms: dict[str, Tensor],
+    model: SceneModel,
+    step: int,
+    data: TrainingPhotos,
+    job: Job,
+    epoch: int,
+    context: Context,
 ) -> None:
-    """Stop before a loss that is not finite reaches a checkpoint."""
-    bad = [name for name, value in terms.items() if not math.isfinite(float(value))]
+    """Stop before numbers that are not finite reach a checkpoint."""
+    bad = [f"the loss {name}" for name, value in terms.items() if not math.isfinite(float(value))]
+    bad += [f"the weights {name}" for name, value in model.named_parameters() if not bool(value.isfinite().all())][:3]
     if bad:
+        world = context.world_size
         chosen = patches(
-            job.patch,
-            data.sizes,
-            step=step - 1,
-            rank=context.rank,
-            world_size=context.world_size,
-            steps_per_epoch=epoch,
+            job.patch, data.sizes, step=step - 1, rank=context.rank, world_size=world, steps_per_epoch=epoch
         )
         names = sorted({data.photos.records[data.index[p.photo]].name for p in chosen})
         raise TrainingError(
-            f"step {step - 1}: the loss {', '.join(bad)} is not a finite number (photos {', '.join(names)}). "
+            f"step {step - 1}: {', '.join(bad)} not finite (photos of this rank: {', '.join(names)}). "
             f"The last good checkpoint is in {checkpoints(job)}; a lower learning rate is the usual cure"
         )
-
-
-# ------------------------------------------------------------------------------------------------- TensorBoard
-
-
-def psnr_of(mse: Tensor | float) -> float:
-    """-10 log10 of a mean squared error."""
-    return -10 * math.log10(max(float(mse), 1e-10))
-
-
-def write_scalars(
-    writer: SummaryWriter,
-    step: int,
-    terms: dict[str, Tensor],
-    watched: dict[str, Tensor],
-    optimiser: torch.optim.Optimizer,
-    rays_per_second: float,
-) -> None:
-    """Every loss term, what is watched, speed, learning rates, memory."""
-    for name, value in terms.items():
-        writer.add_scalar(f"loss/{name}", float(value), step)
-    writer.add_scalar("loss/total", float(sum(terms.values())), step)
-    writer.add_scalar("train/psnr", psnr_of(watched["mse"]), step)
-    if "mask" in watched:
-        writer.add_scalar("train/mask_share", float(watched["mask"]), step)
-    for group in optimiser.param_groups:
-        writer.add_scalar(f"learning_rate/{group['part']}", group["lr"], step)
-    writer.add_scalar("speed/rays_per_second", rays_per_second, step)
-    writer.add_scalar("memory/resident_MiB", psutil.Process().memory_info().rss / 2**20, step)
-    if torch.cuda.is_available():
-        writer.add_scalar("memory/gpu_peak_MiB", torch.cuda.max_memory_allocated() / 2**20, step)
-
-
-def write_pictures(writer: SummaryWriter, step: int, model: SceneModel, photos: Photos) -> None:
-    """A fixed validation view (a training view where there is no other) with its PSNR, depth, and mask."""
-    index = (photos.indices("val") or photos.indices("train"))[0]
-    camera = photos.records[index]
-    stride = max(1, round(max(camera.width, camera.height) / PICTURE_SIDE))
-    model.eval()
-    view = render_view(model, camera, stride=stride)
-    picture = colour_view(model, view, read_appearance(model, photos.reference(index)))
-    photo = photos.image(index)[stride // 2 :: stride, stride // 2 :: stride] / 255
-    writer.add_image("view/rendered", picture, step, dataformats="HWC")
-    writer.add_image("view/photo", photo, step, dataformats="HWC")
-    depth = (view.depth / view.depth.max().clamp(min=1e-6)).cpu().numpy()
-    writer.add_image("view/depth", depth, step, dataformats="HW")
-    writer.add_scalar("view/psnr", psnr_of(float(np.square(picture - photo).mean())), step)
-    if model.segmenter is not None:
-        reference = as_tensor(photos.reference(index), view.depth.device)
-        mask = model.transient_mask(reference, view.size).cpu().numpy()
-        writer.add_image("view/mask", mask, step, dataformats="HW")
-    model.train()
 
 
 def device_name(device: torch.device) -> str:

@@ -38,9 +38,7 @@ def pick_device(job: Job, local_rank: int) -> torch.device:
     """
     available = torch.cuda.is_available()
     if job.device == "cuda" and not available:
-        raise CrossrayError(
-            "device: cuda, but torch sees no GPU here; --set device=cpu trains on the processor"
-        )
+        raise CrossrayError("device: cuda, but torch sees no GPU here; --set device=cpu trains on the processor")
     if job.device == "cpu" or not available:
         return torch.device("cpu")
     if local_rank >= torch.cuda.device_count():
@@ -66,9 +64,7 @@ def run_rank(job: Job) -> dict[str, Any]:
             f"`torchrun --nproc-per-node={job.ranks} -m pipeline run JOB.yaml --launcher torchrun`"
         ) from None
     if world != job.ranks:
-        raise CrossrayError(
-            f"ranks: the job wants {job.ranks}, torchrun started {world}; --set ranks={world} fits"
-        )
+        raise CrossrayError(f"ranks: the job wants {job.ranks}, torchrun started {world}; --set ranks={world} fits")
     device = pick_device(job, local_rank)
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
     try:

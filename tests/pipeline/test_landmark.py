@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pipeline import landmark
 from pipeline.errors import CrossrayError
 from pipeline.landmark import Landmark, draw_photo, write_landmark
-from pipeline.landmark_light import draw_light, draw_response
-from pipeline.landmark_photo import depth_map, photograph
-from pipeline.landmark_scene import solids
-from pipeline.landmark_tracer import (
+from pipeline.landmark import collection as landmark
+from pipeline.landmark.light import draw_light, draw_response
+from pipeline.landmark.photo import depth_map, photograph
+from pipeline.landmark.scene import solids
+from pipeline.landmark.tracer import (
     Pinhole,
     box,
     checker,
@@ -61,7 +61,7 @@ def picture(path: Path) -> np.ndarray:
 def hit_one(solid, origin, direction):
     o, d = (tuple(np.array([x], np.float32) for x in v) for v in (origin, direction))
     t = solid.hit(o, d)
-    return float(t[0]), tuple(a + t * b for a, b in zip(o, d, strict=True))
+    return float(t[0]), tuple(a + b * np.where(np.isinf(t), 0, t) for a, b in zip(o, d, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,9 @@ def test_a_ray_meets_a_solid_where_geometry_says(solid, origin, direction, t, no
 @pytest.mark.parametrize(
     "solid", [box(-1, 1, -1, 1, 0, 2, GREY), ellipsoid((0, 0, 1), (1, 1, 1), GREY), frustum((0, 0), 0, 2, 1, 1, GREY)]
 )
-@pytest.mark.parametrize(("origin", "direction"), [((3, 3, 1), (0, 1, 0)), ((0, -4, 1), (0, -1, 0)), ((0, 4, 3), (0, -1, 0))])
+@pytest.mark.parametrize(
+    ("origin", "direction"), [((3, 3, 1), (0, 1, 0)), ((0, -4, 1), (0, -1, 0)), ((0, 4, 3), (0, -1, 0))]
+)
 def test_a_ray_that_passes_by_or_leaves_misses(solid, origin, direction):
     assert hit_one(solid, origin, direction)[0] == math.inf
 
@@ -116,8 +118,8 @@ def test_pulse_is_the_average_of_stripes_over_the_footprint(x, w, duty, period):
 
 def test_a_board_seen_from_far_away_is_even():
     x = np.linspace(0, 10, 50)
-    assert checker(x, x, 0.5, 1e-3, 1e-3).std() > 0.3
-    assert checker(x, x, 0.5, 50.0, 50.0).std() < 0.02
+    assert checker(x, 0.1, 0.5, 1e-3, 1e-3).std() > 0.3
+    assert checker(x, 0.1, 0.5, 49.7, 0.01).std() < 0.02
 
 
 # ---- files
@@ -246,7 +248,7 @@ def test_tourists_cast_shadows_beside_themselves(scene):
     response = draw_response(np.random.default_rng(0), light)
     person = landmark.Tourist("person", 0.5, -3.6, 0.0, 0.285, ((0.9, 0.9, 0.9),) * 5)
     clean, photo = photograph(LEVEL, light, response, [person])
-    u, v, _ = LEVEL.project(np.array([[0.85, -3.18, 0.0]]))  # 0.55 away from the sun
+    u, v, _ = LEVEL.project(np.array([[0.664, -3.405, 0.0]]))  # where the chest's shadow falls
     row, column = int(v[0]), int(u[0])
     assert photo[row, column].astype(int).sum() < clean[row, column].astype(int).sum() - 60
 
@@ -308,9 +310,12 @@ def test_colmap_reads_cameras_poses_and_points_back(scene):
         for xy, xyz in seen:
             assert np.abs(image.project_point(xyz) - xy).max() < 1
             u, v, z = record.camera.project(xyz[None])
-            agree.append(abs(depth[int(v[0]), int(u[0])] / z[0] - 1) < 0.05)
-    # The pixel's centre may lie on another surface than the point, next to an edge or at a glancing angle.
-    assert np.mean(agree) > 0.85
+            # Next to an edge the pixel's centre may lie on another surface than the point: look around it.
+            row, column = int(v[0]), int(u[0])
+            around = depth[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+            if around.shape == (3, 3):
+                agree.append(0.97 * around.min() < z[0] < 1.03 * around.max())
+    assert np.mean(agree) > 0.99
     assert {record.model for record in map(scene.record, scene.names())} == {"PINHOLE", "SIMPLE_PINHOLE"}
 
 
@@ -322,7 +327,7 @@ def test_held_out_views_lie_within_the_training_ones(seed):
     angles = {"train": [], "test": []}
     for index in range(64):
         split = "train" if index < 48 else "test"
-        _, camera = landmark._draw_camera(np.random.default_rng((seed, index)), index / 64 * 48 % 1, split, 96)
+        _, camera = landmark._draw_camera(np.random.default_rng((seed, index)), index * 0.618034 % 1, split, 96)
         angles[split].append(math.atan2(camera.centre[0], -0.6 - camera.centre[1]))
     assert max(map(abs, angles["test"])) < max(map(abs, angles["train"]))
     assert max(angles["train"]) - min(angles["train"]) > math.radians(105)

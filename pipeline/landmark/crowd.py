@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .landmark_light import RGB, Light
-from .landmark_scene import OBSTACLES, RADIUS, solids
-from .landmark_tracer import (
+from pipeline.landmark.light import RGB, Light
+from pipeline.landmark.scene import OBSTACLES, RADIUS, solids
+from pipeline.landmark.tracer import (
+    Paint,
     Pinhole,
     Solid,
     Vec,
@@ -97,11 +98,11 @@ def _person(t: Tourist) -> list[Solid]:
     def at(forward: float, left: float) -> tuple[float, float]:
         return t.x + (forward * c - left * s) * h, t.y + (forward * s + left * c) * h
 
-    def face(p, n, w):
+    def face(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         x, _, z = _local(t, p)
         return mix(skin, hair, (z > 0.945 * h) | ((x < 0.0) & (z > 0.88 * h)))
 
-    def sleeve(p, n, w):
+    def sleeve(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         return mix(np.array(shirt) * 0.8, skin, p[2] < 0.47 * h)
 
     parts: list[Solid] = [
@@ -118,7 +119,7 @@ def _person(t: Tourist) -> list[Solid]:
         parts.append(ellipsoid((*at(-0.13, 0), 0.68 * h), (0.09 * h, 0.11 * h, 0.15 * h), plain(other), t.yaw))
     if t.extra == "umbrella":
 
-        def gores(p, n, w):
+        def gores(p: Vec, n: Vec, w: Vec) -> np.ndarray:
             x, y, _ = _local(t, p)
             return mix(other, np.array(other) * 0.45, pulse(np.arctan2(y, x), math.pi / 4, 0.5, 0.1))
 
@@ -137,12 +138,12 @@ def _wheels(t: Tourist, radius: float) -> list[Solid]:
     return parts
 
 
-def _glass(t: Tourist, bottom: float, top: float, bay: float):
+def _glass(t: Tourist, bottom: float, top: float, bay: float) -> Paint:
     """Body paint with a band of dark windows and lamps on the ends."""
     length, width, height = _dimensions(t)
     body, stripe = t.colours
 
-    def paint(p, n, w):
+    def paint(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         x, y, z = _local(t, p)
         side = np.abs(n[2]) < 0.85
         end = np.abs(x) > 0.47 * length
@@ -182,9 +183,7 @@ def _van(t: Tourist) -> list[Solid]:
 def _coach(t: Tourist) -> list[Solid]:
     length, width, height = _dimensions(t)
     paint = _glass(t, 0.55 * height, 0.85 * height, 0.15 * length)
-    body = tapered(
-        (t.x, t.y), t.yaw, 0.1 * height, height, (length, width), (0.98 * length, 0.95 * width), paint
-    )
+    body = tapered((t.x, t.y), t.yaw, 0.1 * height, height, (length, width), (0.98 * length, 0.95 * width), paint)
     return [body, *_wheels(t, 0.13 * height)]
 
 
@@ -194,7 +193,7 @@ COARSE = 64  # cells on the long side of the grid on which coverage is measured
 
 
 def place_crowd(rng: np.random.Generator, camera: Pinhole, light: Light, target: float) -> list[Tourist]:
-    """A crowd that changes about `target` of the picture's pixels (a share), shadows included where the sun casts them."""
+    """A crowd that changes about the share `target` of the picture's pixels, counting the shadows that show."""
     if target <= 0:
         return []
     hits = trace_grid(camera, solids(), COARSE / max(camera.width, camera.height))

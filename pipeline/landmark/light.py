@@ -1,7 +1,7 @@
 """What differs between two photos of one view: the light, the sky and the camera's response.
 
-All of it is global to a photo and smooth in its parameters. `Light` is in linear radiance (a white surface in full noon sun is
-about 1); `Response` turns that into 8-bit RGB.
+All of it is global to a photo and smooth in its parameters. `Light` is in linear radiance (a white surface in
+full noon sun is about 1); `Response` turns that into 8-bit RGB.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .landmark_tracer import Vec, dot, unit
+from pipeline.landmark.tracer import Vec, dot, each, unit
 
 RGB = tuple[float, float, float]
 
@@ -123,12 +123,14 @@ def sky(light: Light, d: Vec) -> np.ndarray:
     )
     cover = 1 / (1 + np.exp(-4.0 * (billow - 1.0 + 1.5 * light.cloudiness)))
     shade = 0.86 + 0.14 * np.tanh(billow - 0.6)
-    return colour + (cloud * shade - colour) * cover * min(1.0, 0.3 + 1.4 * light.cloudiness) * np.minimum(1, 0.35 + 3 * up)
+    return colour + (cloud * shade - colour) * cover * min(1.0, 0.3 + 1.4 * light.cloudiness) * np.minimum(
+        1, 0.35 + 3 * up
+    )
 
 
 def shine(light: Light, albedo: np.ndarray, n: Vec, lit: np.ndarray, openness: np.ndarray) -> np.ndarray:
     """Radiance (3, n) of matt surfaces: sun where lit, a bright hemisphere above and a bounce from the ground below."""
-    towards = unit(tuple(np.float32(x) for x in light.towards_sun))
+    towards = unit(each(np.float32, light.towards_sun))
     direct = np.maximum(dot(n, towards), 0) * lit
     sun, ambient = (np.array(c, np.float32)[:, None] for c in (light.sun, light.ambient))
     above = 0.5 + 0.5 * n[2]

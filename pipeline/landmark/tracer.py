@@ -5,8 +5,8 @@ Notation: the world has z up and the ground at z = 0. Vectors of many rays are t
 A ray is origin + t * direction; a miss is t = inf. Directions from a camera have a z-component of 1 in the camera's
 frame, so their t *is* the z-depth.
 
-A solid has `paint(p, n, w) -> (3, n)`, its linear albedo at points p with normals n; w = (wx, wy, wz) is the footprint of
-a sample along each world axis, by which the patterns below filter themselves.
+A solid has `paint(p, n, w) -> (3, n)`, its linear albedo at points p with normals n; w = (wx, wy, wz) is the
+footprint of a sample along each world axis, by which the patterns below filter themselves.
 """
 
 from __future__ import annotations
@@ -14,20 +14,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 Vec = tuple[np.ndarray, np.ndarray, np.ndarray]
+Broadcast = Any  # an array, a number, or a triple of either that broadcasts against arrays
 Paint = Callable[[Vec, Vec, Vec], np.ndarray]
 EPS = 1e-4
 
 
-def dot(a: Vec | Sequence[float], b: Vec | Sequence[float]) -> np.ndarray:
+def dot(a: Broadcast, b: Broadcast) -> Any:
     """Sum of products; either side may be three plain numbers."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def take(v: Vec, index) -> Vec:
+def each(function: Callable[..., Any], *triples: Broadcast) -> Vec:
+    """The function applied to x, y and z of the triples."""
+    x, y, z = (function(*parts) for parts in zip(*triples, strict=True))
+    return x, y, z
+
+
+def take(v: Vec, index: Any) -> Vec:
     """The same triple at `index` (a mask, integers, or slices)."""
     return v[0][index], v[1][index], v[2][index]
 
@@ -50,7 +58,7 @@ class Solid:
     rough: float = 0.0  # how much the foliage's ripples bend the normal
     casts: bool = True
 
-    def hit(self, o, d) -> np.ndarray:
+    def hit(self, o: Broadcast, d: Broadcast) -> Any:
         """Smallest t > EPS, or inf. `o` and `d` broadcast against each other."""
         raise NotImplementedError
 
@@ -64,8 +72,9 @@ class Convex(Solid):
 
     planes: tuple[tuple[float, float, float, float], ...] = ()
 
-    def hit(self, o, d):
-        near, far = np.float32(-np.inf), np.float32(np.inf)
+    def hit(self, o: Broadcast, d: Broadcast) -> Any:
+        near: Any = np.float32(-np.inf)
+        far: Any = np.float32(np.inf)
         for a, b, c, offset in self.planes:
             along = dot((a, b, c), d)
             along = np.where(along == 0, np.float32(1e-12), along)
@@ -74,7 +83,7 @@ class Convex(Solid):
             far = np.where(along > 0, np.minimum(far, t), far)
         return np.where((near <= far) & (near > EPS), near, np.float32(np.inf))
 
-    def normal(self, p):
+    def normal(self, p: Vec) -> Vec:
         best = np.full(p[0].shape, -np.inf, np.float32)
         normal = np.zeros((3, *p[0].shape), np.float32)
         for a, b, c, offset in self.planes:
@@ -91,11 +100,11 @@ class Ellipsoid(Solid):
     radii: tuple[float, float, float] = (1, 1, 1)
     yaw: float = 0.0
 
-    def _to_sphere(self, v):
+    def _to_sphere(self, v: Broadcast) -> Broadcast:
         x, y = _turn_arrays(v[0], v[1], -self.yaw)
         return x / self.radii[0], y / self.radii[1], v[2] / self.radii[2]
 
-    def hit(self, o, d):
+    def hit(self, o: Broadcast, d: Broadcast) -> Any:
         cx, cy, cz = self.centre
         start = self._to_sphere((o[0] - cx, o[1] - cy, o[2] - cz))
         along = self._to_sphere(d)
@@ -104,14 +113,14 @@ class Ellipsoid(Solid):
         t = (-b - np.sqrt(np.maximum(root, 0))) / a
         return np.where((root > 0) & (t > EPS), t, np.float32(np.inf))
 
-    def normal(self, p):
+    def normal(self, p: Vec) -> Vec:
         cx, cy, cz = self.centre
         x, y, z = self._to_sphere((p[0] - cx, p[1] - cy, p[2] - cz))
         x, y = _turn_arrays(x / self.radii[0], y / self.radii[1], self.yaw)
         return unit((x, y, z / self.radii[2]))
 
 
-def _turn_arrays(x, y, yaw: float):
+def _turn_arrays(x: Broadcast, y: Broadcast, yaw: float) -> Broadcast:
     if yaw == 0:
         return x, y
     c, s = math.cos(yaw), math.sin(yaw)
@@ -128,7 +137,7 @@ class Frustum(Solid):
     r0: float = 1.0
     r1: float = 1.0
 
-    def hit(self, o, d):
+    def hit(self, o: Broadcast, d: Broadcast) -> Any:
         slope = (self.r1 - self.r0) / (self.z1 - self.z0)
         x, y, z = o[0] - self.at[0], o[1] - self.at[1], o[2]
         radius = self.r0 + slope * (z - self.z0)
@@ -137,7 +146,7 @@ class Frustum(Solid):
         b = x * d[0] + y * d[1] - slope * radius * d[2]
         inside = b * b - a * (x * x + y * y - radius * radius)
         root = np.sqrt(np.maximum(inside, 0))
-        best = np.float32(np.inf)
+        best: Any = np.float32(np.inf)
         for t in ((-b - root) / a, (-b + root) / a):
             height = z + t * d[2]
             good = (inside > 0) & (t > EPS) & (height >= self.z0) & (height <= self.z1)
@@ -149,7 +158,7 @@ class Frustum(Solid):
             best = np.where((t > EPS) & (px * px + py * py <= r * r) & (t < best), t, best)
         return best
 
-    def normal(self, p):
+    def normal(self, p: Vec) -> Vec:
         slope = (self.r1 - self.r0) / (self.z1 - self.z0)
         x, y = p[0] - self.at[0], p[1] - self.at[1]
         r = np.sqrt(np.maximum(x * x + y * y, 1e-12))
@@ -167,12 +176,12 @@ class Ground(Solid):
 
     radius: float = 1.0
 
-    def hit(self, o, d):
+    def hit(self, o: Broadcast, d: Broadcast) -> Any:
         t = -o[2] / np.where(d[2] == 0, np.float32(1e-12), d[2])
         x, y = o[0] + t * d[0], o[1] + t * d[1]
         return np.where((t > EPS) & (x * x + y * y <= self.radius**2), t, np.float32(np.inf))
 
-    def normal(self, p):
+    def normal(self, p: Vec) -> Vec:
         zero = np.zeros_like(p[0])
         return zero, zero, zero + 1
 
@@ -184,7 +193,7 @@ class Surround(Solid):
     radius: float = 1.0
     skyline: Callable[[np.ndarray], np.ndarray] = field(default=np.zeros_like)
 
-    def hit(self, o, d):
+    def hit(self, o: Broadcast, d: Broadcast) -> Any:
         a = d[0] * d[0] + d[1] * d[1]
         b = o[0] * d[0] + o[1] * d[1]
         c = o[0] * o[0] + o[1] * o[1] - self.radius**2
@@ -193,20 +202,29 @@ class Surround(Solid):
         top = self.skyline(np.arctan2(o[0] + t * d[0], o[1] + t * d[1]))
         return np.where((height >= 0) & (height <= top), t, np.float32(np.inf))
 
-    def normal(self, p):
+    def normal(self, p: Vec) -> Vec:
         return unit((-p[0], -p[1], np.full_like(p[0], 0.35 * self.radius)))
 
 
 # ---- making solids
 
 
-def box(x0, x1, y0, y1, z0, z1, paint: Paint) -> Convex:
+def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, paint: Paint) -> Convex:
     """An upright box along the axes."""
     at, size = ((x0 + x1) / 2, (y0 + y1) / 2), (x1 - x0, y1 - y0)
     return tapered(at, 0.0, z0, z1, size, size, paint)
 
 
-def tapered(at, yaw: float, z0: float, z1: float, bottom, top, paint: Paint, shift: float = 0.0) -> Convex:
+def tapered(
+    at: Sequence[float],
+    yaw: float,
+    z0: float,
+    z1: float,
+    bottom: Sequence[float],
+    top: Sequence[float],
+    paint: Paint,
+    shift: float = 0.0,
+) -> Convex:
     """A block whose `bottom` (length, width) and `top` differ; the top may be shifted along its length."""
     (l0, w0), (l1, w1), rise = bottom, top, z1 - z0
     planes = [(0.0, 0.0, 1.0, z1), (0.0, 0.0, -1.0, -z0)]
@@ -228,19 +246,21 @@ def tapered(at, yaw: float, z0: float, z1: float, bottom, top, paint: Paint, shi
     return Convex(paint, np.array(corners) + [at[0], at[1], 0], planes=tuple(placed))
 
 
-def ellipsoid(centre, radii, paint: Paint, yaw: float = 0.0, rough: float = 0.0) -> Ellipsoid:
+def ellipsoid(
+    centre: Sequence[float], radii: Sequence[float], paint: Paint, yaw: float = 0.0, rough: float = 0.0
+) -> Ellipsoid:
     reach = (max(radii[:2]), max(radii[:2]), radii[2]) if yaw else radii
-    centre = tuple(map(float, centre))
-    return Ellipsoid(paint, _box_corners(centre, reach), rough, centre=centre, radii=tuple(radii), yaw=yaw)
+    (x, y, z), (a, b, c) = map(float, centre), map(float, radii)
+    return Ellipsoid(paint, _box_corners(centre, reach), rough, centre=(x, y, z), radii=(a, b, c), yaw=yaw)
 
 
-def frustum(at, z0, z1, r0, r1, paint: Paint) -> Frustum:
+def frustum(at: Sequence[float], z0: float, z1: float, r0: float, r1: float, paint: Paint) -> Frustum:
     r = max(r0, r1)
     corners = _box_corners((at[0], at[1], (z0 + z1) / 2), (r, r, (z1 - z0) / 2))
     return Frustum(paint, corners, at=(float(at[0]), float(at[1])), z0=z0, z1=z1, r0=r0, r1=r1)
 
 
-def _box_corners(centre, reach) -> np.ndarray:
+def _box_corners(centre: Sequence[float], reach: Sequence[float]) -> np.ndarray:
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     return np.array(centre) + signs * np.array(reach)
 
@@ -280,7 +300,7 @@ class Pinhole:
         return self.fx * x / safe + self.cx, self.fy * y / safe + self.cy, z
 
     def window(self, corners: np.ndarray) -> tuple[float, float, float, float] | None:
-        """Bounds (u0, u1, v0, v1) of the hull of `corners`, infinite where it reaches behind the camera; None unseen."""
+        """Bounds (u0, u1, v0, v1) of `corners`; infinite where they reach behind the camera, None if all do."""
         u, v, z = self.project(corners)
         if z.max() < 0.02:
             return None
@@ -301,20 +321,18 @@ class Hits:
     t: np.ndarray
     which: np.ndarray
 
-    def points(self, index) -> Vec:
+    def points(self, index: Any) -> Vec:
         t, d, c = self.t[index], take(self.rays, index), self.camera.centre
         return c[0] + t * d[0], c[1] + t * d[1], c[2] + t * d[2]
 
 
 def trace_grid(camera: Pinhole, solids: Sequence[Solid], samples: float) -> Hits:
-    """Rays through a grid of round(samples * side) cells a side of the picture; 1 = pixel centres, 2 = 2 x 2 a pixel."""
+    """Rays through a grid of round(samples * side) cells: 1 gives the pixel centres, 2 gives 2 x 2 a pixel."""
     columns, rows = round(camera.width * samples), round(camera.height * samples)
     u = (np.arange(columns) + 0.5) * (camera.width / columns)
     v = (np.arange(rows) + 0.5) * (camera.height / rows)
     rays = camera.directions(u[None, :], v[:, None])
-    hits = Hits(
-        camera, rays, np.full(rays[0].shape, np.inf, np.float32), np.full(rays[0].shape, -1, np.int16)
-    )
+    hits = Hits(camera, rays, np.full(rays[0].shape, np.inf, np.float32), np.full(rays[0].shape, -1, np.int16))
     add_solids(hits, solids, first=0)
     return hits
 
@@ -365,7 +383,7 @@ def sunlit(points: Vec, solids: Sequence[Solid], sun: Sequence[float]) -> np.nda
     up = np.cross(side, sun)
     axes = np.array([side, up, sun])
     a, b, c = (dot(points, axis) for axis in axes.astype(np.float32))
-    towards = tuple(np.float32(x) for x in sun)
+    towards = each(np.float32, sun)
     lit = np.ones(points[0].shape, bool)
     for solid in solids:
         if not solid.casts:
@@ -381,24 +399,24 @@ def sunlit(points: Vec, solids: Sequence[Solid], sun: Sequence[float]) -> np.nda
 # ---- patterns that filter themselves
 
 
-def pulse(x, period: float, duty: float, w) -> np.ndarray:
+def pulse(x: Broadcast, period: float, duty: float, w: Broadcast) -> np.ndarray:
     """Share of [x - w/2, x + w/2] in which frac(x / period) < duty: stripes that never alias."""
     w = np.maximum(w, 1e-3 * period) / period
     x = x / period
 
-    def filled(s):
+    def filled(s: np.ndarray) -> np.ndarray:
         whole = np.floor(s)
         return whole * duty + np.minimum(s - whole, duty)
 
     return (filled(x + w / 2) - filled(x - w / 2)) / w
 
 
-def checker(x, y, period: float, wx, wy) -> np.ndarray:
+def checker(x: Broadcast, y: Broadcast, period: float, wx: Broadcast, wy: Broadcast) -> np.ndarray:
     """1 on the black fields of a board with squares of `period`, 0 on the white ones, filtered."""
     return 0.5 + 0.5 * (2 * pulse(x, 2 * period, 0.5, wx) - 1) * (2 * pulse(y, 2 * period, 0.5, wy) - 1)
 
 
-def ripple(p, scale: float, w) -> np.ndarray:
+def ripple(p: Vec, scale: float, w: Broadcast) -> np.ndarray:
     """Smooth noise of wavelengths about `scale`, in [-1, 1], gone where the footprint w nears the wavelength."""
     f = 2 * math.pi / scale
     x, y, z = (v * f for v in p)
@@ -410,12 +428,12 @@ def ripple(p, scale: float, w) -> np.ndarray:
     return wave / 3 * fade(scale, w)
 
 
-def fade(period: float, w) -> np.ndarray:
+def fade(period: float, w: Broadcast) -> np.ndarray:
     """Contrast left of a pattern of `period` under a footprint w."""
     return np.exp(-((2.2 * w / period) ** 2))
 
 
-def mix(a, b, share) -> np.ndarray:
+def mix(a: Broadcast, b: Broadcast, share: Broadcast) -> np.ndarray:
     """Colours (3,) or (3, n) blended: b where share (n,) is 1."""
     a, b = (np.asarray(c, np.float32).reshape(3, -1) for c in (a, b))
     return a + (b - a) * share

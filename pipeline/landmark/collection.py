@@ -11,7 +11,8 @@
     truth/arguments.json               written first: what was asked for
     truth/landmark.json                written last: the recorded scene, from which any other pair can be rendered
 
-Photo i is a pure function of (seed, i, its split, size, sun_jitter). One COLMAP unit is a fifth of the building's width; z is up.
+Photo i is a pure function of (seed, i, its split, size, sun_jitter). One COLMAP unit is a fifth of the building's
+width; z is up.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import io
 import json
 import math
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -29,14 +30,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from .errors import CrossrayError
-from .files import atomic_write
-from .landmark_crowd import Tourist, place_crowd
-from .landmark_light import RGB, Light, Response, draw_light, draw_response
-from .landmark_photo import depth_map, photograph
-from .landmark_scene import OBSTACLES, SUN, solids, surfaces
-from .landmark_tracer import Pinhole, trace_grid, trace_points
-from .launch.tasks import Mapper, in_process
+from pipeline.errors import CrossrayError
+from pipeline.files import atomic_write
+from pipeline.landmark.crowd import Tourist, place_crowd
+from pipeline.landmark.light import RGB, Light, Response, draw_light, draw_response
+from pipeline.landmark.photo import depth_map, photograph
+from pipeline.landmark.scene import OBSTACLES, SUN, solids, surfaces
+from pipeline.landmark.tracer import Pinhole, trace_grid, trace_points
+
+Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 FORMAT = 1
 SPLITS = ("train", "val", "test")
@@ -79,11 +81,12 @@ def write_landmark(
     size: int = 128,
     seed: int = 0,
     sun_jitter: float = 0.0,
-    mapper: Mapper = in_process,
+    mapper: Mapper = map,
 ) -> Path:
-    """Write the scene into `root` and return `root`; what an interrupted run left is finished, a complete one is kept.
+    """Write the scene into `root` and return `root`; an interrupted one is finished, a complete one is kept.
 
-    `size` is the long side in pixels; `sun_jitter` the standard deviation in degrees of the sun's direction between photos.
+    `size` is the long side in pixels; `sun_jitter` the standard deviation in degrees of the sun's direction
+    between photos.
     Raises CrossrayError for arguments out of range and where `root` holds something else.
     """
     root = Path(root)
@@ -153,7 +156,7 @@ def _claim(root: Path, asked: dict[str, Any]) -> bool:
 
 
 def _make_photos(batch: _Batch) -> dict[int, tuple[PhotoRecord, np.ndarray, np.ndarray]]:
-    """Write a batch's files. Returns per index: the record, the numbers of the points that it sees, where it sees them."""
+    """Write a batch's files. Returns per index the record and what `_observations` found."""
     results = {}
     for index, split in batch.photos:
         record = draw_photo(batch.seed, index, split, batch.size, batch.sun_jitter)
@@ -165,8 +168,8 @@ def _make_photos(batch: _Batch) -> dict[int, tuple[PhotoRecord, np.ndarray, np.n
 def draw_photo(seed: int, index: int, split: str, size: int, sun_jitter: float) -> PhotoRecord:
     """Camera, light, response and crowd of photo `index`.
 
-    Where a photo stands on the arc, its weather, and how crowded it is follow low-discrepancy sequences in `index`, so that even
-    a few photos are spread evenly; the rest is drawn from a generator keyed by (seed, index).
+    Where a photo stands on the arc, its weather, and how crowded it is follow low-discrepancy sequences in
+    `index`, so that even a few photos are spread evenly; the rest is drawn from a generator keyed by (seed, index).
     """
     start = np.random.default_rng((seed, 0)).random(3)
     along, weather, crowded = (
@@ -181,11 +184,11 @@ def draw_photo(seed: int, index: int, split: str, size: int, sun_jitter: float) 
 
 
 def _wanted_share(crowded: float, split: str) -> float:
-    """Share of the pixels that tourists change, at a quantile: none on every eighth photo, 8 % on average, up to 26 %."""
+    """Share of the pixels that tourists are to change: none on every eighth photo, 8 % on average."""
     if crowded < 0.125:
         return 0.0
-    share = 0.02 + 0.24 * ((crowded - 0.125) / 0.875) ** 2.1
-    return share if split != "test" else 0.4 * share
+    share = 0.02 + 0.26 * ((crowded - 0.125) / 0.875) ** 2.1
+    return share if split != "test" else 0.35 * share
 
 
 def _draw_sun(rng: np.random.Generator, jitter: float) -> RGB:
@@ -223,7 +226,7 @@ def _draw_camera(rng: np.random.Generator, along: float, split: str, size: int) 
     return "PINHOLE", Pinhole(width, height, focal, fy, cx, cy, rotation, centre)
 
 
-def _look(centre, target, roll: float) -> tuple[tuple[float, float, float], ...]:
+def _look(centre: Sequence[float], target: Sequence[float], roll: float) -> tuple[tuple[float, float, float], ...]:
     """Rows right, down, forward of a camera that looks at `target` and is held `roll` radians askew."""
     forward = np.subtract(target, centre)
     forward /= np.linalg.norm(forward)
@@ -263,36 +266,44 @@ def _png(pixels: np.ndarray) -> bytes:
 # ---- the COLMAP model
 
 POINTS = 4000
-SEEN_AT_MOST = 700  # points a photo
+SEEN_NEAREST, SEEN_ELSEWHERE = 300, 700  # points a photo, at most
 
 
 @cache
 def surface_points(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) float64 on the visible surfaces and their colours (n, 3) uint8: hits from twelve places on the arc."""
+    """Points (n, 3) float64 on the surfaces seen from the arc, and their colours (n, 3) uint8."""
     rng = np.random.default_rng((seed, 2))
     places, tints = [], []
-    for angle in np.linspace(-1.05, 1.05, 12):
-        eye = (4.6 * math.sin(angle), -0.6 - 4.6 * math.cos(angle), float(rng.uniform(0.3, 1.3)))
-        camera = Pinhole(96, 64, 85.0, 85.0, 48.0, 32.0, _look(eye, (0.0, -0.5, 0.95), 0.0), eye)
+    for k, angle in enumerate(np.linspace(-1.15, 1.15, 12)):
+        # Every other place lies behind and above the photographers: there are points at their feet, too.
+        distance, height, aim = ((4.6, 0.8, 0.95), (7.2, 2.6, -2.2))[k % 2]
+        eye = (distance * math.sin(angle), -0.6 - distance * math.cos(angle), height)
+        camera = Pinhole(96, 72, 56.0, 56.0, 48.0, 36.0, _look(eye, (0.0, -0.5, aim), 0.0), eye)
         hits = trace_grid(camera, solids(), 1)
-        # The pavement at the cameras' feet is left out: it would put points behind the photographers.
-        seen = rng.permutation(np.flatnonzero((hits.which >= 0) & (hits.t > 1.2)))[: POINTS // 12 + 1]
+        seen = rng.permutation(np.flatnonzero(hits.which >= 0))
         points, _, albedo = surfaces(hits, seen, list(solids()))
-        places.append(np.array(points, np.float64).T)
-        tints.append(albedo.T)
+        # As in real models few points are far away: readers take the scene's box from percentiles.
+        radius = np.hypot(points[0], points[1])
+        near = radius < np.where(points[1] < -2, 6.9, 5.0)
+        kept = np.flatnonzero(near | (rng.random(seen.size) < 0.12))[: POINTS // 12 + 1]
+        places.append(np.array(points, np.float64).T[kept])
+        tints.append(albedo.T[kept])
     colours = np.round(255 * np.clip(np.concatenate(tints), 0, 1) ** (1 / 2.2)).astype(np.uint8)
     return np.concatenate(places)[:POINTS], colours[:POINTS]
 
 
 def _observations(seed: int, index: int, camera: Pinhole) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (n,) of the surface points that a camera sees, and the pixels (n, 2) where a feature detector finds them."""
+    """Numbers (n,) of the surface points that a camera sees, and where (n, 2) a feature detector finds them."""
     rng = np.random.default_rng((seed, 3, index))
     points, _ = surface_points(seed)
     u, v, z = camera.project(points)
     inside = np.flatnonzero((z > 0.05) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height))
     hits = trace_points(camera, solids(), u[inside], v[inside])
     inside = inside[np.abs(hits.t - z[inside]) < 2e-3 * z[inside]]
-    inside = np.sort(rng.permutation(inside)[:SEEN_AT_MOST])
+    # The nearest first: few photos see what lies at a photographer's feet, and bounds come from such points.
+    inside = inside[np.argsort(z[inside], kind="stable")]
+    others = rng.permutation(inside[SEEN_NEAREST:])[:SEEN_ELSEWHERE]
+    inside = np.sort(np.concatenate([inside[:SEEN_NEAREST], others]))
     noise = np.clip(rng.normal(0, 0.15, (inside.size, 2)), -0.4, 0.4)
     return inside, np.stack([u[inside], v[inside]], 1) + noise
 
@@ -303,34 +314,39 @@ def _write_model(folder: Path, seed: int, records: list[PhotoRecord], seen: list
 
     model = pycolmap.Reconstruction()
     points, colours = surface_points(seed)
-    tracks: dict[int, list[tuple[int, int]]] = {}
-    for i, (numbers, _) in enumerate(seen):
-        for k, number in enumerate(numbers.tolist()):
-            tracks.setdefault(number, []).append((i + 1, k))
     for i, (record, (_, pixels)) in enumerate(zip(records, seen, strict=True)):
         camera_id = (i + 1) % len(records) + 1
         c = record.camera
         params = [c.fx, c.cx, c.cy] if record.model == "SIMPLE_PINHOLE" else [c.fx, c.fy, c.cx, c.cy]
         model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=camera_id, model=record.model, width=c.width, height=c.height, params=params
-            )
+            pycolmap.Camera(camera_id=camera_id, model=record.model, width=c.width, height=c.height, params=params)
         )
         rotation = np.array(c.rotation)
         image = pycolmap.Image(name=record.name, keypoints=pixels, camera_id=camera_id, image_id=i + 1)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -(rotation * np.array(c.centre)).sum(1))
         model.add_image_with_trivial_frame(image, pose)
-    for number in sorted(tracks):
-        if len(tracks[number]) < 2:
-            continue
-        track = pycolmap.Track()
-        for image_id, k in tracks[number]:
-            track.add_element(image_id, k)
+    for number, track in _tracks([numbers for numbers, _ in seen]):
         model.add_point3D(points[number], track, colours[number])
     with tempfile.TemporaryDirectory() as scratch:
         model.write_binary(scratch)
         for file in sorted(Path(scratch).iterdir()):
             atomic_write(folder / file.name, file.read_bytes())
+
+
+def _tracks(seen: list[np.ndarray]) -> Iterator[tuple[int, Any]]:
+    """(number, track) of every point that some photo sees; `seen[i]` are the points of photo i."""
+    import pycolmap
+
+    numbers = np.concatenate(seen)
+    images = np.repeat(np.arange(1, len(seen) + 1), [s.size for s in seen])
+    places = np.concatenate([np.arange(s.size) for s in seen])
+    order = np.argsort(numbers, kind="stable")
+    found, starts = np.unique(numbers[order], return_index=True)
+    for number, mine in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
+        track = pycolmap.Track()
+        for image_id, place in zip(images[mine].tolist(), places[mine].tolist(), strict=True):
+            track.add_element(image_id, place)
+        yield number, track
 
 
 # ---- reading it back
@@ -368,7 +384,7 @@ class Landmark:
         return self.record(name).camera
 
     def truth(self, view: str, appearance: str) -> np.ndarray:
-        """uint8 RGB (h, w, 3): the camera of `view` in the light and with the camera response of `appearance`, nobody there.
+        """uint8 RGB (h, w, 3): the camera of `view` in the light and response of `appearance`, nobody there.
 
         truth(x, x) is the stored clean picture of x, bit for bit.
         """
@@ -399,7 +415,7 @@ def _record(entry: dict[str, Any]) -> PhotoRecord:
 
 
 def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
-    def freeze(value):
+    def freeze(value: Any) -> Any:
         return tuple(map(freeze, value)) if isinstance(value, list) else value
 
     return {key: freeze(value) for key, value in fields.items()}

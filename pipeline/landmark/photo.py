@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .landmark_crowd import Tourist, contacts, crowd_solids
-from .landmark_light import Light, Response, add_haze, develop, shine, sky
-from .landmark_scene import openness, shade_of, solids, surfaces
-from .landmark_tracer import Hits, Pinhole, Vec, add_solids, dot, sunlit, take, trace_grid, unit
+from pipeline.landmark.crowd import Tourist, contacts, crowd_solids
+from pipeline.landmark.light import Light, Response, add_haze, develop, shine, sky
+from pipeline.landmark.scene import openness, shade_of, solids, surfaces
+from pipeline.landmark.tracer import Hits, Pinhole, Solid, Vec, add_solids, dot, each, sunlit, take, trace_grid, unit
 
 SAMPLES = 2  # a side of a pixel; the mean of the 2 x 2 radiances is the area filter
 
@@ -24,7 +24,7 @@ def photograph(
     points, normals, albedo = surfaces(hits, seen, still)
     lit = _lit(points, normals, still, light)
     share = openness(points, normals)
-    radiance = sky(light, unit(tuple(d.reshape(-1) for d in hits.rays)))
+    radiance = sky(light, unit(each(np.ravel, hits.rays)))
     radiance[:, seen] = _shaded(light, hits, seen, albedo, normals, lit, share)
     clean = develop(response, _pixels(radiance, camera))
     if not crowd:
@@ -54,23 +54,25 @@ def depth_map(camera: Pinhole) -> np.ndarray:
 
 def _lift(points: Vec, normals: Vec) -> Vec:
     """Points a little off their surface, so that rounding cannot put them below it."""
-    return tuple(p + np.float32(2e-3) * n for p, n in zip(points, normals, strict=True))
+    return each(lambda p, n: p + np.float32(2e-3) * n, points, normals)
 
 
-def _lit(points: Vec, normals: Vec, shapes, light: Light) -> np.ndarray:
-    lit = dot(normals, tuple(map(np.float32, light.towards_sun))) > 0
+def _lit(points: Vec, normals: Vec, shapes: Sequence[Solid], light: Light) -> np.ndarray:
+    lit = dot(normals, each(np.float32, light.towards_sun)) > 0
     facing = np.flatnonzero(lit)
     lit[facing] = sunlit(_lift(take(points, facing), take(normals, facing)), shapes, light.towards_sun)
     return lit
 
 
-def _shaded(light: Light, hits: Hits, index, albedo, normals, lit, share) -> np.ndarray:
-    d = take(tuple(r.reshape(-1) for r in hits.rays), index)
+def _shaded(
+    light: Light, hits: Hits, index: np.ndarray, albedo: np.ndarray, normals: Vec, lit: np.ndarray, share: np.ndarray
+) -> np.ndarray:
+    d = take(each(np.ravel, hits.rays), index)
     distance = hits.t.reshape(-1)[index] * np.sqrt(dot(d, d))
     return add_haze(light, shine(light, albedo, normals, lit, share), distance)
 
 
-def _within(points: Vec, sphere, times: float = 4.0) -> np.ndarray:
+def _within(points: Vec, sphere: Sequence[float], times: float = 4.0) -> np.ndarray:
     reach = times * sphere[3]
     return (np.abs(points[0] - sphere[0]) < reach) & (np.abs(points[1] - sphere[1]) < reach) & (points[2] < 1.0)
 

@@ -1,7 +1,7 @@
 """The built-in landmark itself: a museum with a portico, a dome and two wings, on its square.
 
 One world unit is about six metres; the building is five units wide, faces -y, and its axis is x = 0. Everything here is
-fixed: what differs between photos is in landmark_light.py and landmark_crowd.py. Albedos are linear RGB.
+fixed: what differs between photos is in light.py and crowd.py. Albedos are linear RGB.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from .landmark_tracer import (
+from pipeline.landmark.tracer import (
     Ground,
     Hits,
     Paint,
@@ -21,6 +21,7 @@ from .landmark_tracer import (
     box,
     checker,
     dot,
+    each,
     ellipsoid,
     fade,
     frustum,
@@ -33,6 +34,7 @@ from .landmark_tracer import (
     unit,
 )
 
+RGB = tuple[float, float, float]
 SUN = (-0.52, -0.62, 0.588)  # towards the sun, from the left and in front; made a unit vector where used
 RADIUS = 8.0  # of the ground and of the trees around it
 FOUNTAIN = (0.0, -2.35)
@@ -45,16 +47,16 @@ OBSTACLES = [(0.0, -2.35, 0.66), (1.72, -2.0, 0.3), (-1.75, -2.0, 0.36), (1.75, 
 # ---- materials
 
 
-def _along_face(p: Vec, n: Vec, w: Vec):
+def _along_face(p: Vec, n: Vec, w: Vec) -> tuple[np.ndarray, np.ndarray]:
     """The horizontal coordinate that runs along an upright wall, and its footprint."""
     sideways = np.abs(n[0]) > np.abs(n[1])
     return np.where(sideways, p[1], p[0]), np.where(sideways, w[1], w[0])
 
 
-def ashlar(colour, course: float = 0.13, length: float = 0.34, mortar: float = 0.62, tint: float = 0.12):
+def ashlar(colour: RGB, course: float = 0.13, length: float = 0.34, mortar: float = 0.62, tint: float = 0.12) -> Paint:
     """Coursed stone or brick: staggered blocks of slightly different tints with joints between them."""
 
-    def paint(p: Vec, n: Vec, w: Vec):
+    def paint(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         s, ws = _along_face(p, n, w)
         row = np.floor(p[2] / course)
         s = s + 0.5 * length * (row % 2)
@@ -67,19 +69,19 @@ def ashlar(colour, course: float = 0.13, length: float = 0.34, mortar: float = 0
     return paint
 
 
-def veined(colour, scale: float = 0.35, depth: float = 0.1):
+def veined(colour: RGB, scale: float = 0.35, depth: float = 0.1) -> Paint:
     """Marble: a smooth grain."""
 
-    def paint(p: Vec, n: Vec, w: Vec):
+    def paint(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         return np.array(colour, np.float32)[:, None] * (1 + depth * ripple(p, scale, np.maximum(w[0], w[2])))
 
     return paint
 
 
-def column(at, drum: float = 0.24):
+def column(at: tuple[float, float], drum: float = 0.24) -> Paint:
     """Fluted marble drums."""
 
-    def paint(p: Vec, n: Vec, w: Vec):
+    def paint(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         angle = np.arctan2(p[1] - at[1], p[0] - at[0])
         flute = np.cos(14 * angle) * fade(0.04, 0.5 * (w[0] + w[1]))
         level = 1 + 0.1 * flute + 0.05 * np.sin(np.floor(p[2] / drum) * 5.1 + at[0] * 7)
@@ -89,13 +91,13 @@ def column(at, drum: float = 0.24):
     return paint
 
 
-def _facade(p: Vec, n: Vec, w: Vec):
+def _facade(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     """The wall behind the columns: warm plaster, a tall dark door, two windows, and niches on the sides."""
     wall = ashlar((0.58, 0.34, 0.22), 0.16, 0.4, 0.75, 0.08)(p, n, w)
     front = n[1] < -0.5
     x, z = np.abs(p[0]), p[2]
 
-    def opening(centre, half, bottom, top):
+    def opening(centre: float, half: float, bottom: float, top: float) -> np.ndarray:
         return front & (np.abs(x - centre) < half) & (z > bottom) & (z < top)
 
     wall = mix(wall, MARBLE, opening(0, 0.27, 0.27, 1.09))
@@ -105,7 +107,7 @@ def _facade(p: Vec, n: Vec, w: Vec):
     return mix(wall, (0.06, 0.08, 0.12), opening(0.75, 0.12, 0.6, 1.02))
 
 
-def _wing(p: Vec, n: Vec, w: Vec):
+def _wing(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     """Brick with two rows of windows in pale frames over a stone base."""
     wall = ashlar((0.55, 0.31, 0.21), 0.09, 0.26, 0.8, 0.1)(p, n, w)
     s, ws = _along_face(p, n, w)
@@ -113,7 +115,7 @@ def _wing(p: Vec, n: Vec, w: Vec):
     bay = 0.3
     upright = np.abs(n[2]) < 0.5
 
-    def windows(width, bottom, top):
+    def windows(width: float, bottom: float, top: float) -> np.ndarray:
         row = upright & (((p[2] > bottom) & (p[2] < top)) | ((p[2] > bottom + 0.44) & (p[2] < top + 0.44)))
         return pulse(s - (bay - width) / 2, bay, width / bay, ws) * row
 
@@ -123,7 +125,7 @@ def _wing(p: Vec, n: Vec, w: Vec):
     return mix(wall, LIMESTONE, upright & (np.abs(p[2] - 0.57) < 0.025))
 
 
-def _frieze(p: Vec, n: Vec, w: Vec):
+def _frieze(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     s, ws = _along_face(p, n, w)
     stone = veined(LIMESTONE)(p, n, w)
     band = (p[2] > 1.33) & (p[2] < 1.45) & (np.abs(n[2]) < 0.5)
@@ -131,7 +133,7 @@ def _frieze(p: Vec, n: Vec, w: Vec):
     return mix(stone, field, band)
 
 
-def _pediment(p: Vec, n: Vec, w: Vec):
+def _pediment(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     """A blue field with a golden sun between pale mouldings; terracotta on the slopes."""
     slope_height = 1.575 + 0.43 * (1 - np.abs(p[0]) / 1.5)
     front = n[1] < -0.5
@@ -146,14 +148,14 @@ def _pediment(p: Vec, n: Vec, w: Vec):
     return mix(_tiles(p, n, w), face, np.abs(n[2]) < 0.5)
 
 
-def _tiles(p: Vec, n: Vec, w: Vec):
+def _tiles(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     """Roof tiles in rows."""
     rows = pulse(p[1], 0.12, 0.25, w[1])
     level = (1 - 0.22 * rows) * (1 + 0.12 * ripple(p, 0.3, w[0]))
     return np.array((0.5, 0.2, 0.11), np.float32)[:, None] * level
 
 
-def _drum(p: Vec, n: Vec, w: Vec):
+def _drum(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     """Twelve arched windows between pilasters."""
     angle = np.arctan2(p[0], -(p[1] - DOME_AT[1])) / (2 * math.pi) * 12
     wide = (w[0] + w[1]) / 2 / 0.3
@@ -163,7 +165,7 @@ def _drum(p: Vec, n: Vec, w: Vec):
     return mix(stone, (0.1, 0.12, 0.17), (x < 0.22) & (p[2] > 1.92 + LIFT) & (p[2] < arch) & (np.abs(n[2]) < 0.5))
 
 
-def _dome(p: Vec, n: Vec, w: Vec):
+def _dome(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     """Green copper with sixteen ribs, greener where the rain runs."""
     angle = np.arctan2(p[0] - DOME_AT[0], -(p[1] - DOME_AT[1])) / (2 * math.pi) * 16
     r = np.sqrt((p[0] - DOME_AT[0]) ** 2 + (p[1] - DOME_AT[1]) ** 2)
@@ -172,10 +174,10 @@ def _dome(p: Vec, n: Vec, w: Vec):
     return mix(base, (0.1, 0.26, 0.24), rib)
 
 
-def leaves(colour, scale: float = 0.16):
+def leaves(colour: RGB, scale: float = 0.16) -> Paint:
     """Foliage: clumps of light and dark green."""
 
-    def paint(p: Vec, n: Vec, w: Vec):
+    def paint(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         wide = np.minimum(w[0], w[2])
         level = 1 + 0.34 * ripple(p, scale, wide) + 0.25 * ripple(p, 2.7 * scale, wide) + 0.15 * n[2]
         return np.array(colour, np.float32)[:, None] * np.maximum(level, 0.25)
@@ -183,7 +185,7 @@ def leaves(colour, scale: float = 0.16):
     return paint
 
 
-def _ground(p: Vec, n: Vec, w: Vec):
+def _ground(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     """Paving with rings around the fountain, two lawns with kerbs, grass around the building, gravel outside."""
     x, y = p[0], p[1]
     wx, wy = w[0], w[1]
@@ -223,7 +225,7 @@ def _skyline(angle: np.ndarray) -> np.ndarray:
     )
 
 
-def _far_trees(p: Vec, n: Vec, w: Vec):
+def _far_trees(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     angle = np.arctan2(p[0], p[1])
     clump = np.sin(23 * angle) * np.sin(5 * p[2] + 9 * angle) + 0.6 * np.sin(47 * angle + 6 * p[2])
     level = 1 + 0.22 * clump * fade(0.9, w[0]) + 0.35 * (p[2] - 0.5)
@@ -261,11 +263,12 @@ def _building() -> list[Solid]:
         for k in range(3)
     ]
     parts += [
-        box(-1.42, 1.42, -0.05, 1.6, 0.0, 1.3, _facade),
+        box(-1.4, 1.4, -0.05, 1.6, 0.0, 1.46, _facade),
+        box(-1.46, 1.46, 0.29, 1.66, 1.43, 1.5, marble),
         box(-0.9, 0.9, 0.0, 1.6, 1.5, 1.78 + LIFT, stone),
     ]
     for side in (-1, 1):
-        x0, x1 = sorted((1.42 * side, 2.6 * side))
+        x0, x1 = sorted((1.38 * side, 2.6 * side))
         parts += [
             box(x0, x1, 0.15, 1.35, 0.0, 1.06, _wing),
             box(x0 - 0.04, x1 + 0.04, 0.1, 1.4, 1.06, 1.13, marble),
@@ -317,7 +320,7 @@ def _square() -> list[Solid]:
     marble, stone, bronze = veined(MARBLE), ashlar(LIMESTONE, 0.09, 0.2), veined((0.2, 0.3, 0.24), 0.2, 0.25)
     x, y = FOUNTAIN
 
-    def water(p: Vec, n: Vec, w: Vec):
+    def water(p: Vec, n: Vec, w: Vec) -> np.ndarray:
         r = np.sqrt((p[0] - x) ** 2 + (p[1] - y) ** 2)
         inside = (n[2] > 0.7) & (r < 0.47)
         return mix(marble(p, n, w), mix((0.12, 0.34, 0.42), (0.2, 0.46, 0.52), pulse(r, 0.11, 0.5, w[0])), inside)
@@ -349,7 +352,7 @@ def _square() -> list[Solid]:
     return parts
 
 
-def _flowers(p: Vec, n: Vec, w: Vec):
+def _flowers(p: Vec, n: Vec, w: Vec) -> np.ndarray:
     angle = np.arctan2(p[1] + 2.0, p[0] + 1.75) / (2 * math.pi) * 6
     petals = mix((0.7, 0.1, 0.12), (0.82, 0.62, 0.12), pulse(angle, 1.0, 0.5, w[0] / 0.3))
     return petals * (1 + 0.2 * ripple(p, 0.12, w[0]))
@@ -390,7 +393,7 @@ def surfaces(hits: Hits, index: np.ndarray, shapes: tuple[Solid, ...] | list[Sol
     """Points, normals and albedo (3, n) at the hits number `index` (flat) of rays against `shapes`."""
     which = hits.which.reshape(-1)[index]
     t = hits.t.reshape(-1)[index]
-    rays = take(tuple(r.reshape(-1) for r in hits.rays), index)
+    rays = take(each(np.ravel, hits.rays), index)
     c = hits.camera.centre
     points = c[0] + t * rays[0], c[1] + t * rays[1], c[2] + t * rays[2]
     normals = np.zeros((3, index.size), np.float32)

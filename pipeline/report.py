@@ -1,0 +1,67 @@
+"""report.html: one self-contained page with the scores and the pictures, readable offline and on a phone."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipeline.files import atomic_write
+
+STYLE = """
+:root { color-scheme: light dark; --line: #8884; }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 1500px; padding: 0 1rem; }
+h1 { font-size: 1.5rem; margin-bottom: 0; } h2 { font-size: 1rem; margin: 1.6rem 0 .4rem; font-weight: 600; }
+table { border-collapse: collapse; margin: 1rem 0; } td, th { padding: .2rem .9rem .2rem 0; text-align: left; }
+tr { border-bottom: 1px solid var(--line); } td:nth-child(2) { font-variant-numeric: tabular-nums; font-weight: 600; }
+.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: .5rem; }
+figure { margin: 0; } img { width: 100%; image-rendering: pixelated; border-radius: 3px; display: block; }
+figcaption { font-size: .8rem; opacity: .75; padding: .15rem 0; }
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One view: a title and named uint8 pictures, (h, w, 3) or (h, w)."""
+
+    title: str
+    pictures: dict[str, np.ndarray]
+
+
+def write_report(path: Path, summary: dict[str, Any], rows: list[Row]) -> Path:
+    """Write the page; returns its path."""
+    scores = "".join(
+        f"<tr><td>{html.escape(key)}</td><td>{value:.3f}</td></tr>"
+        for key, value in summary.items()
+        if isinstance(value, float)
+    )
+    views = "".join(
+        f"<h2>{html.escape(row.title)}</h2><div class=row>"
+        + "".join(figure(caption, picture) for caption, picture in row.pictures.items())
+        + "</div>"
+        for row in rows
+    )
+    page = (
+        "<!doctype html><html lang=en><meta charset=utf-8>"
+        "<meta name=viewport content='width=device-width, initial-scale=1'>"
+        f"<title>Crossray</title><style>{STYLE}</style>"
+        "<h1>Crossray: the landmark without its tourists</h1>"
+        f"<table>{scores}</table>{views}</html>"
+    )
+    atomic_write(path, page)
+    return path
+
+
+def figure(caption: str, picture: np.ndarray) -> str:
+    """A captioned picture, its bytes inside the page."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="PNG", optimize=True)
+    data = base64.b64encode(buffer.getvalue()).decode()
+    text = html.escape(caption)
+    return f"<figure><img alt='{text}' src='data:image/png;base64,{data}'><figcaption>{text}</figcaption></figure>"

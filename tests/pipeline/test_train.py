@@ -1,0 +1,497 @@
+"""Training on one rank: it learns, resumes to the bit, refuses what is not its own, and stops before it saves nonsense."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import time
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tiny_run import assert_same_bits, cut_tiny, final_state, tiny_job, tiny_mapping, tiny_photos, train_until
+
+from pipeline import train as module
+from pipeline.checkpoint import CheckpointError, committed, read_checkpoint
+from pipeline.config import load_job, make_job
+from pipeline.errors import CrossrayError
+from pipeline.launch import run as launch
+from pipeline.launch.run import claim_run, ensure_shards, run_job
+from pipeline.launch.torchrun import pick_device, run_rank
+from pipeline.train import Context, TrainingError, checkpoints, train
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory):
+    """One scene and its shards for all tests of this file."""
+    return cut_tiny(tmp_path_factory.mktemp("tiny"))
+
+
+@pytest.fixture(autouse=True)
+def _cache(cut, monkeypatch):
+    monkeypatch.setenv("CROSSRAY_CACHE", str(cut / "cache"))
+
+
+@pytest.fixture
+def make(cut, tmp_path):
+    """make(method, **train settings): a tiny job whose runs are this test's own."""
+
+    def of(method="crossray", name="tiny", over=None, **settings):
+        job = tiny_job(cut, method, {"name": name, "runs": str(tmp_path / "runs"), "train": settings})
+        return make_job(merge_job(job, over)) if over else job
+
+    def merge_job(job, over):
+        from pipeline.config import merge
+
+        return merge(job.model_dump(mode="json"), over)
+
+    return of
+
+
+@pytest.fixture
+def agree_every_3(monkeypatch):
+    monkeypatch.setattr(module, "AGREE_EVERY", 3)
+
+
+@pytest.fixture
+def losses(monkeypatch):
+    """Total loss and terms of every step taken."""
+    taken: list[dict[str, float]] = []
+    step = module.training_step
+
+    def spy(*args):
+        terms, watched = step(*args)
+        taken.append({k: float(v) for k, v in terms.items()} | {"mse": float(watched["mse"])})
+        return terms, watched
+
+    monkeypatch.setattr(module, "training_step", spy)
+    return taken
+
+
+# Learning
+
+
+@pytest.mark.parametrize("method", ["crossray", "nerf"])
+def test_losses_fall(make, losses, method):
+    settings = {"epochs": 1, "steps_per_epoch": 40}
+    if method == "nerf":
+        settings["learning_rates"] = dict.fromkeys(("grid", "field", "appearance", "transient"), 5e-3)
+    result = train(make(method, **settings), Context())
+    assert result["finished"]
+    assert result["steps"] == len(losses) == 40
+    first, last = losses[:6], losses[-6:]  # as many steps as show every photo
+    for key in ("fine", "mse"):
+        assert sum(s[key] for s in last) < 0.7 * sum(s[key] for s in first), key
+    assert all(math.isfinite(v) for s in losses for v in s.values())
+
+
+def test_every_term_of_the_full_method_is_there(make, losses):
+    over = {"patch": {"photos": 1}}
+    train(make("crnerf", over=over, epochs=1, steps_per_epoch=2), Context())
+    assert losses[0].keys() == {"fine", "coarse", "mask", "embedding", "appearance", "content", "mse"}
+
+
+def test_training_json_says_what_was_done(make):
+    job = make("nerf", epochs=2, steps_per_epoch=4)
+    result = train(job, Context())
+    assert json.loads((job.run / "training.json").read_text()) == result
+    expected = {"steps": 8, "ranks": 1, "finished": True, "steps_per_epoch": 4, "rays_a_step": 128, "bfloat16": False}
+    assert expected.items() <= result.items()
+    assert result["train_seconds"] > 0
+    assert [p.name for p in committed(checkpoints(job))] == ["step-00000008"]
+
+
+def test_an_epoch_by_itself_sees_as_many_rays_as_there_are_pixels(make, cut):
+    job = make("nerf", epochs=1, steps_per_epoch="auto")
+    assert train(job, Context())["steps"] == 4 * 24 * 18 // 128  # 4 training photos of 24 x 18
+
+
+def test_a_run_that_has_ended_does_nothing_more(make, losses):
+    job = make("nerf")
+    first = train(job, Context())
+    before = (checkpoints(job) / "step-00000012" / "meta.json").stat().st_mtime_ns
+    count = len(losses)
+    again = train(job, Context())
+    assert len(losses) == count
+    assert (again["steps"], again["finished"]) == (first["steps"], True)
+    assert again["train_seconds"] == pytest.approx(first["train_seconds"])
+    assert (checkpoints(job) / "step-00000012" / "meta.json").stat().st_mtime_ns == before
+
+
+def test_the_same_job_gives_the_same_bits_and_another_seed_others(make):
+    jobs = [make("nerf", "a"), make("nerf", "b"), make("nerf", "c", over={"patch": {"seed": 1}})]
+    for job in jobs:
+        train(job, Context())
+    a, b, c = (final_state(job) for job in jobs)
+    assert_same_bits(a, b)
+    assert not torch.equal(a[0]["field.fine.density.weight"], c[0]["field.fine.density.weight"])
+
+
+def test_checkpoints_come_when_asked_and_the_oldest_go(make):
+    job = make("nerf", checkpoint_every=2, keep_checkpoints=3)
+    train(job, Context())
+    assert [p.name for p in committed(checkpoints(job))] == ["step-00000008", "step-00000010", "step-00000012"]
+
+
+# Exact resume
+
+
+@pytest.mark.parametrize("method", ["crossray", "crnerf"])
+def test_stopped_and_resumed_is_the_same_to_the_bit(make, agree_every_3, losses, method):
+    over = {"patch": {"photos": 1}} if method == "crnerf" else None
+    straight, stopped = (make(method, name, over=over) for name in ("straight", "stopped"))
+    assert train(straight, Context())["steps"] == 12
+    of_straight = losses[:]
+    losses.clear()
+    partial = train_until(stopped, 6)
+    assert (partial["steps"], partial["finished"]) == (6, False)
+    assert [p.name for p in committed(checkpoints(stopped))] == ["step-00000006"]
+    final = train(stopped, Context())
+    assert (final["steps"], final["finished"]) == (12, True)
+    assert losses == of_straight  # every term of every step
+    model, optimiser = final_state(stopped)
+    expected_model, expected_optimiser = final_state(straight)
+    assert_same_bits(dict(model), dict(expected_model), "model")
+    assert_same_bits(optimiser, expected_optimiser, "optimiser")
+
+
+def test_pictures_and_checkpoints_on_the_way_change_nothing(make):
+    """Pictures are rendered in evaluation mode, between two steps."""
+    plain = make("crossray", "plain")
+    busy = make("crossray", "busy", picture_every=2, checkpoint_every=2, log_every=1)
+    for job in (plain, busy):
+        train(job, Context())
+    assert_same_bits(dict(final_state(plain)[0]), dict(final_state(busy)[0]))
+
+
+def test_a_stop_between_two_agreements_waits_for_the_next(make):
+    result = train_until(make("nerf", epochs=4), 7)  # the ranks agree every 10 steps
+    assert (result["steps"], result["finished"]) == (module.AGREE_EVERY, False)
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "training.pt"])
+def test_a_damaged_checkpoint_falls_back_and_ends_with_the_same_bits(make, file, agree_every_3):
+    straight, damaged = make("crossray", "straight", checkpoint_every=3), make("crossray", "damaged", checkpoint_every=3)
+    train(straight, Context())
+    assert train_until(damaged, 9)["steps"] == 9
+    path = checkpoints(damaged) / "step-00000009" / file
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    assert train(damaged, Context())["finished"]
+    model, optimiser = final_state(damaged)
+    expected_model, expected_optimiser = final_state(straight)
+    assert_same_bits(dict(model), dict(expected_model))
+    assert_same_bits(optimiser, expected_optimiser)
+    assert read_checkpoint(path.parent).step == 9  # mended on the way
+
+
+@pytest.mark.parametrize(
+    ("over", "what"),
+    [
+        ({"train": {"learning_rates": {"field": 0.1}}}, "job"),
+        ({"patch": {"seed": 5}}, "job"),
+        ({"losses": {"embedding": 1.0}}, "job"),
+    ],
+    ids=str,
+)
+def test_another_jobs_checkpoint_is_refused(make, over, what):
+    job = make("nerf")
+    train(job, Context())
+    with pytest.raises(TrainingError, match=rf"other {what}.*--set name=") as error:
+        train(make("nerf", over=over), Context())
+    assert str(job.run) in str(error.value)
+
+
+def test_other_shards_are_refused(make, tmp_path):
+    job = make("nerf")
+    train(job, Context())
+    other = tiny_job(cut_tiny(tmp_path / "other", seed=9))
+    moved = job.model_copy(update={"scene": other.scene})
+    with pytest.raises(TrainingError, match=r"other shards.*--set name="):
+        train(moved, Context())
+
+
+def test_another_number_of_ranks_is_refused(make):
+    """Without a process group: the refusal comes before anything is computed."""
+    job = make("nerf")
+    train(job, Context())
+    (meta,) = checkpoints(job).glob("*/meta.json")
+    meta.write_text(meta.read_text().replace('"world_size": 1', '"world_size": 2'))
+    with pytest.raises((TrainingError, CheckpointError)):
+        train(job, Context())
+
+
+def test_where_a_run_lies_does_not_enter_its_identity(make, tmp_path, agree_every_3):
+    job = make("nerf")
+    train_until(job, 6)
+    shutil.move(tmp_path / "runs", tmp_path / "moved")
+    moved = job.model_copy(update={"runs": tmp_path / "moved"})
+    assert train(moved, Context())["steps"] == 12
+
+
+# Losses that are not finite
+
+
+def exploding(make, name="tiny", **settings):
+    rates = dict.fromkeys(("grid", "field", "appearance", "transient"), 1e30)
+    return make("nerf", name, epochs=4, learning_rates=rates, **settings)
+
+
+def test_a_loss_that_is_not_finite_stops_with_step_term_and_photos(make):
+    with pytest.raises(TrainingError, match=r"step \d+: .*loss .*(fine|coarse).*not .*finite") as error:
+        train(exploding(make, log_every=1), Context())
+    assert re.search(r"photo_00[0125]\.jpg", str(error.value))
+    assert "lower learning rate" in str(error.value)
+
+
+def assert_only_finite_checkpoints(job):
+    for target in committed(checkpoints(job)):
+        bad = [k for k, v in read_checkpoint(target).model.items() if not v.isfinite().all()]
+        assert not bad, f"{target.name} was committed with {bad}"
+
+
+@pytest.mark.parametrize("log_every", [1, 100])
+def test_weights_that_are_not_finite_are_never_committed(make, log_every):
+    """Whatever the distance between two logs: a checkpoint must not outrun the check."""
+    job = exploding(make, log_every=log_every, checkpoint_every=1)
+    with pytest.raises(TrainingError):
+        train(job, Context())
+    assert_only_finite_checkpoints(job)
+
+
+def test_a_stop_does_not_commit_weights_that_are_not_finite(make, agree_every_3):
+    job = exploding(make, log_every=100)
+    with pytest.raises(TrainingError):
+        train_until(job, 6)
+    assert committed(checkpoints(job)) == []
+
+
+def test_a_gradient_that_is_not_finite_never_reaches_a_checkpoint(make, monkeypatch):
+    """The loss of the last step is fine, and its gradient is not: only the weights tell."""
+    step = module.training_step
+
+    def poison(ddp, optimiser, job, data, number, epoch, context):
+        found = step(ddp, optimiser, job, data, number, epoch, context)
+        if number == 11:
+            with torch.no_grad():
+                next(ddp.parameters()).fill_(math.nan)
+        return found
+
+    monkeypatch.setattr(module, "training_step", poison)
+    job = make("nerf")
+    with pytest.raises(TrainingError):
+        train(job, Context())
+    assert_only_finite_checkpoints(job)
+
+
+def test_the_last_good_checkpoint_survives_and_is_named(make, monkeypatch):
+    step = module.training_step
+
+    def poison(ddp, optimiser, job, data, number, epoch, context):
+        if number == 7:
+            with torch.no_grad():
+                next(ddp.parameters()).fill_(math.nan)
+        return step(ddp, optimiser, job, data, number, epoch, context)
+
+    monkeypatch.setattr(module, "training_step", poison)
+    job = make("nerf", log_every=1, checkpoint_every=2)
+    with pytest.raises(TrainingError, match="step 7: ") as error:
+        train(job, Context())
+    assert str(checkpoints(job)) in str(error.value)
+    assert [p.name for p in committed(checkpoints(job))][-1] == "step-00000006"
+    assert_only_finite_checkpoints(job)
+    monkeypatch.undo()
+
+
+# TensorBoard
+
+
+def events(job) -> EventAccumulator:
+    return EventAccumulator(str(job.run / "tensorboard"), size_guidance={"scalars": 0, "images": 0}).Reload()
+
+
+def test_tensorboard_has_every_term_and_the_pictures(make):
+    job = make("crossray", log_every=3, picture_every=6)
+    train(job, Context())
+    found = events(job)
+    scalars, images = set(found.Tags()["scalars"]), set(found.Tags()["images"])
+    assert {
+        "loss/fine",
+        "loss/mask",
+        "loss/embedding",
+        "loss/interlevel",
+        "loss/total",
+        "train/psnr",
+        "train/mask_share",
+        "learning_rate/grid",
+        "learning_rate/field",
+        "learning_rate/appearance",
+        "learning_rate/transient",
+        "speed/rays_per_second",
+        "memory/resident_MiB",
+        "view/psnr",
+    } <= scalars
+    assert {"view/rendered", "view/photo", "view/depth", "view/mask"} <= images
+    assert [e.step for e in found.Scalars("loss/fine")] == [3, 6, 9, 12]
+    assert [e.step for e in found.Images("view/rendered")] == [6, 12]
+    total = found.Scalars("loss/total")[0].value
+    parts = sum(found.Scalars(tag)[0].value for tag in scalars if tag.startswith("loss/") and tag != "loss/total")
+    assert total == pytest.approx(parts, rel=1e-5)
+    picture = found.Images("view/rendered")[0]
+    assert (picture.width, picture.height) == (24, 18)  # the validation photo, small enough to be whole
+
+
+def test_tensorboard_shows_the_learning_rate_of_the_step(make):
+    job = make("nerf", log_every=3)
+    train(job, Context())
+    shown = [e.value for e in events(job).Scalars("learning_rate/field")]
+    assert shown == pytest.approx([5e-4, 5e-4, 1e-8 + (5e-4 - 1e-8) / 2, 1e-8 + (5e-4 - 1e-8) / 2], rel=1e-5)
+
+
+def test_tensorboard_of_a_resumed_run_has_each_step_once(make, agree_every_3):
+    job = make("nerf", log_every=1, checkpoint_every=100)
+    train_until(job, 6)
+    train(job, Context())
+    assert [e.step for e in events(job).Scalars("loss/fine")] == list(range(1, 13))
+
+
+def test_without_a_validation_photo_a_training_photo_is_shown(make, tmp_path):
+    cut_tiny_without_val = tmp_path / "noval"
+    from tiny_scene import write_tiny_scene
+
+    write_tiny_scene(cut_tiny_without_val / "scene", photos=2, splits=["train", "train"])
+    job = tiny_job(cut_tiny_without_val, "nerf", {"train": {"epochs": 1, "steps_per_epoch": 1}})
+    from pipeline.launch.tasks import in_process
+    from pipeline.shards import cut_shards
+
+    cut_shards(job.scene.path, job.shards, downscale=2, reference_downscale=1, plan=job.patch, mapper=in_process)
+    train(job, Context())
+    assert "view/rendered" in events(job).Tags()["images"]
+
+
+# Time
+
+
+def test_a_budget_of_seconds_is_kept(make):
+    began = time.monotonic()
+    job = make("nerf", seconds=0.6)
+    result = train(job, Context())
+    wall = time.monotonic() - began
+    assert result["finished"]
+    assert result["steps"] % module.AGREE_EVERY == 0
+    assert result["steps"] > 0
+    assert 0.6 <= result["train_seconds"] <= wall
+    slowest_agreement = module.AGREE_EVERY * 0.5  # generous: a step takes about 10 ms
+    assert result["train_seconds"] < 0.6 + slowest_agreement
+    assert [p.name for p in committed(checkpoints(job))] == [f"step-{result['steps']:08d}"]
+
+
+def test_a_stopped_budget_goes_on_from_its_clock(make):
+    job = make("nerf", seconds=1.0)
+    first = train_until(job, module.AGREE_EVERY)
+    assert not first["finished"]
+    again = train(job, Context())
+    assert again["finished"]
+    assert again["steps"] > first["steps"]
+    assert again["train_seconds"] >= 1.0
+    assert train(job, Context())["steps"] == again["steps"]  # the budget is spent
+
+
+# The run's folder
+
+
+def test_claim_run_writes_the_resolved_job(make):
+    job = make("nerf")
+    claim_run(job)
+    assert load_job(job.run / "job.yaml") == job
+    claim_run(job)  # the same job again
+
+
+def test_claim_run_refuses_a_changed_job_and_shows_the_key(make):
+    job = make("nerf")
+    claim_run(job)
+    with pytest.raises(CrossrayError, match=r"train\.epochs: 2 -> 3") as error:
+        claim_run(make("nerf", epochs=3))
+    assert "--set name=" in str(error.value)
+    assert "patch" not in str(error.value)  # only what differs
+    with pytest.raises(CrossrayError, match=r"train\.learning_rates\.grid: 0\.0005 -> 0\.5"):
+        claim_run(make("nerf", learning_rates={"grid": 0.5}))
+    assert load_job(job.run / "job.yaml") == job  # the refused ones left no trace
+
+
+def test_claim_run_lets_where_and_when_change(make):
+    job = make("nerf")
+    claim_run(job)
+    changed = make("nerf", over={"launcher": "torchrun", "threads": 2, "evaluate": {"protocols": ["crnerf-full@R2"]}})
+    claim_run(changed)
+    assert load_job(job.run / "job.yaml") == changed
+
+
+def test_shards_of_another_size_are_refused(make):
+    job = make("nerf", over={"scene": {"downscale": 3}})
+    with pytest.raises(CrossrayError, match=r"scene\.downscale: the job says 3.*cut with 2.*scene\.shards"):
+        ensure_shards(job)
+
+
+def test_missing_shards_are_cut(make, monkeypatch, tmp_path):
+    from contextlib import contextmanager
+
+    from pipeline.launch.tasks import in_process
+    from pipeline.shards import verify_shards
+
+    @contextmanager
+    def tasks():
+        yield in_process
+
+    monkeypatch.setattr(launch, "ray_tasks", tasks)
+    job = make("nerf", over={"scene": {"shards": str(tmp_path / "new" / "shards")}})
+    ensure_shards(job)
+    assert len(verify_shards(job.shards).keys) == 6
+
+
+def test_a_whole_job_trains_and_evaluates(make, monkeypatch):
+    monkeypatch.delenv("CROSSRAY_LPIPS", raising=False)
+    job = make("nerf", over={"evaluate": {"protocols": ["crnerf-full@R2"]}})
+    trained, scores = run_job(job)
+    assert trained["finished"]
+    assert [s["protocol"] for s in scores] == ["crnerf-full@R2"]
+    assert (job.run / "eval" / "crnerf-full@R2" / "step-00000012" / "metrics.json").is_file()
+
+
+@pytest.mark.parametrize("protocol", ["crnerf-ful@R2", "crnerf-full", "crnerf-full@R4"])
+def test_a_protocol_that_cannot_be_is_said_before_the_training(make, losses, protocol):
+    with pytest.raises(CrossrayError, match="crnerf-ful"):
+        run_job(make("nerf", over={"evaluate": {"protocols": [protocol]}}))
+    assert losses == []
+
+
+def test_torchrun_without_torchrun_is_said(make, monkeypatch):
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(CrossrayError, match="torchrun --nproc-per-node=1"):
+        run_rank(make("nerf"))
+
+
+def test_another_number_of_ranks_than_torchruns_is_said(make, monkeypatch):
+    for name, value in (("RANK", "0"), ("WORLD_SIZE", "4"), ("LOCAL_RANK", "0")):
+        monkeypatch.setenv(name, value)
+    with pytest.raises(CrossrayError, match=r"wants 1, torchrun started 4; --set ranks=4"):
+        run_rank(make("nerf"))
+
+
+def test_a_gpu_that_is_not_there_is_said(make, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(CrossrayError, match="--set device=cpu"):
+        pick_device(make("nerf", over={"device": "cuda"}), 0)
+    assert pick_device(make("nerf", over={"device": "auto"}), 3) == torch.device("cpu")
+
+
+def test_the_tiny_scene_is_what_these_tests_think(cut):
+    photos = tiny_photos(cut)
+    assert photos.indices("train") == (0, 1, 2, 5)
+    assert (photos.indices("test"), photos.indices("val")) == ((3,), (4,))
+    assert photos.image(0).shape == (18, 24, 3)
+    assert tiny_mapping(cut)["scene"]["downscale"] == 2
