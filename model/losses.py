@@ -8,7 +8,7 @@ ones: there 1e-3 multiplies the appearance term, not the transient one (docs/dif
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from torch import Tensor
 
@@ -39,6 +39,13 @@ class LossWeights:
     def mask_weight(self, step: int) -> float:
         """Weight of the mask's size at `step`: max(mask_end, mask_start exp(-mask_decay step))."""
         return max(self.mask_end, self.mask_start * math.exp(-self.mask_decay * step))
+
+
+def check_weights(weights: LossWeights) -> None:
+    """ValueError for a negative weight: its term would be driven to infinity."""
+    for field in fields(weights):
+        if getattr(weights, field.name) < 0:
+            raise ValueError(f"losses.{field.name}: {getattr(weights, field.name)} is negative")
 
 
 def photometric(rendered: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:

@@ -12,7 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-STRICT = {"extra": "forbid", "use_attribute_docstrings": True}  # read by the job schema; plain data here
+STRICT = {
+    "extra": "forbid",
+    "use_attribute_docstrings": True,
+    "allow_inf_nan": False,
+}  # read by the job schema; plain data here
 
 
 @dataclass(frozen=True)
@@ -112,12 +116,38 @@ METHODS: dict[str, Method] = {
 }
 
 
+LEAST = {  # sizes below these have no meaning
+    "channels": 1,
+    "mlp.width": 2,
+    "mlp.coarse_samples": 4,
+    "mlp.fine_samples": 1,
+    "mlp.xyz_frequencies": 0,
+    "mlp.dir_frequencies": 0,
+    "mlp.density_noise": 0,
+    "hash.levels": 1,
+    "hash.log2_entries": 1,
+    "hash.min_resolution": 1,
+    "hash.width": 1,
+    "hash.proposal_samples": 1,
+    "hash.samples": 1,
+}
+
+
 def check_spec(spec: ModelSpec) -> None:
     """Refuse choices that do not fit together, with the reason.
 
     Raises:
-        ValueError: an appearance that has no decoder to act on, or sizes that cannot work.
+        ValueError: an appearance that has no decoder to act on, or sizes that cannot work; it names the key.
     """
+    for key, least in LEAST.items():
+        section, _, name = key.rpartition(".")
+        value = getattr(getattr(spec, section) if section else spec, name)
+        if value < least:
+            raise ValueError(f"model.{key}: {value} is too small; at least {least}")
+    if spec.hash.min_resolution > spec.hash.max_resolution:
+        raise ValueError(
+            f"model.hash.min_resolution: {spec.hash.min_resolution} exceeds max_resolution {spec.hash.max_resolution}"
+        )
     if spec.appearance == "crossray" and spec.colour == "head":
         raise ValueError(
             "model.appearance: crossray needs model.colour: decoder, because it transforms rendered features "

@@ -32,7 +32,7 @@ from model.losses import (
     photometric,
 )
 from model.methods import ModelSpec, check_spec
-from model.transient.cgnet import CGNet
+from model.transient.cgnet import CGNet, transient_probability
 from model.transient.unet import UNet
 
 StatisticsPolicy = Literal["view", "patch", "running"]
@@ -47,8 +47,7 @@ class Batch(NamedTuple):
     rays: Rays  # P N rays, patch by patch
     colours: Tensor  # (P, N, 3) in [0, 1]
     positions: Tensor  # (P, N, 2): (x, y) of the pixel's middle in its photo, in (0, 1)
-    references: list[Tensor]  # P photos (3, h, w) in [0, 1], as the segmenter sees them
-    appearances: list[Tensor]  # the same photos, or parts of them, as the encoder sees them
+    references: list[Tensor]  # P photos (3, h, w) in [0, 1], as the encoder and the segmenter see them
     others: list[Tensor]  # P random other photos, for the appearance loss
 
 
@@ -79,9 +78,7 @@ class SceneModel(nn.Module):
         head = spec.colour == "head"
         channels = 3 if head else spec.channels
         self.field: Field = (
-            HashField(spec.hash, channels, head, box)
-            if spec.field == "hash"
-            else NeRFField(spec.mlp, channels)
+            HashField(spec.hash, channels, head, box) if spec.field == "hash" else NeRFField(spec.mlp, channels)
         )
         self.decoder = None if head else AffineDecoder(channels)
         self.encoder: nn.Module | None = None
@@ -115,23 +112,24 @@ class SceneModel(nn.Module):
         with self.autocast(batch.colours.device):
             march = self.field.march(batch.rays, generator)
         features = [level.composite().features.float().unflatten(0, patches) for level in march.levels]
-        terms = {name: getattr(weights, name) * value for name, value in march.losses.items()}
+        terms = {}
+        if "interlevel" in march.losses and weights.interlevel > 0:
+            terms["interlevel"] = weights.interlevel * march.losses["interlevel"]
 
         mask = self.masks(batch)
-        if mask is not None:
+        if mask is not None and weights.mask_weight(step) > 0:
             terms["mask"] = weights.mask_weight(step) * mask_size(mask)
 
         embedding = None
         if self.encoder is not None:
-            embedding = self.encode(batch.appearances)
+            embedding = self.encode(batch.references)
             self.track(features[-1])
-            terms["embedding"] = weights.embedding * embedding_size(embedding)
+            if weights.embedding > 0:
+                terms["embedding"] = weights.embedding * embedding_size(embedding)
         pictures = [self.colours(f, embedding) for f in features]
         terms["fine"] = photometric(pictures[-1], batch.colours, mask)
         if len(pictures) > 1:
-            coarse_mask = (
-                None if mask is None else mask.detach()
-            )  # released code: only the fine level teaches S
+            coarse_mask = None if mask is None else mask.detach()  # released code: only the fine level teaches S
             terms["coarse"] = photometric(pictures[0], batch.colours, coarse_mask)
 
         if self.encoder is not None:
@@ -153,10 +151,7 @@ class SceneModel(nn.Module):
             re_encoded = self.encode(as_images(self.colours(features, other)))
             terms["appearance"] = weights.appearance * appearance_consistency(other, re_encoded)
         if weights.content > 0:
-            plain, transformed = (
-                torch.cat([self.content_encoder(batch) for batch in self.sized(as_images(rgb))])
-                for rgb in (self.decoder(features), picture)
-            )
+            plain, transformed = (embed(self.content_encoder, as_images(c)) for c in (self.decoder(features), picture))
             terms["content"] = weights.content * content_preservation(plain, transformed)
         return terms
 
@@ -181,11 +176,9 @@ class SceneModel(nn.Module):
         """F^a (P, C, g, g) of photos (3, h, w) in [0, 1] (E2)."""
         if self.encoder is None:
             raise ValueError("this model has no appearance: model.appearance is none")
-        return torch.cat([self.encoder(batch) for batch in self.sized(images)])
+        return embed(self.encoder, images)
 
-    def colours(
-        self, features: Tensor, embedding: Tensor | None, content: ContentStatistics | None = None
-    ) -> Tensor:
+    def colours(self, features: Tensor, embedding: Tensor | None, content: ContentStatistics | None = None) -> Tensor:
         """rgb (P, N, 3) of features (P, N, C) in the appearances F^a (P, C, g, g).
 
         Args:
@@ -218,6 +211,8 @@ class SceneModel(nn.Module):
         if self.transform is None:
             return None
         if policy == "running":
+            if self.running_count == 0:
+                raise ValueError("statistics: running, but this model has not been trained")
             return ContentStatistics(self.running_mean, self.running_gram)
         if policy == "patch":
             rows, cols, _ = patch_grid(patch, 1.0, 0.0, 0.0, *size)
@@ -230,7 +225,7 @@ class SceneModel(nn.Module):
         """M (P, N) at the batch's pixels; None where the model handles no transients."""
         if self.segmenter is None:
             return None
-        maps = [m for images in self.sized(batch.references) for m in self.transient_maps(images)]
+        maps = self.transient_maps(batch.references)
         grid = 2 * batch.positions[:, None] - 1
         # Sampling at pixel centres is the released code's resize to the photo's size, at the needed pixels only.
         looked_up = [
@@ -239,27 +234,20 @@ class SceneModel(nn.Module):
         ]
         return torch.cat(looked_up)[:, 0, 0]
 
-    def transient_maps(self, images: Tensor) -> Tensor:
-        """Transient probabilities (P, 1, h', w') of photos (P, 3, h, w), at the network's own resolution."""
+    def transient_maps(self, images: list[Tensor]) -> list[Tensor]:
+        """Transient probabilities (1, h', w') of photos (3, h, w), at the size that the segmenter reads."""
         assert self.segmenter is not None
-        logits = self.segmenter(images)
-        if isinstance(self.segmenter, CGNet):
-            logits = F.interpolate(logits, size=images.shape[-2:], mode="bilinear", align_corners=False)
-        return torch.sigmoid(logits)
+        maps = []
+        for batch in in_batches(images, isinstance(self.segmenter, UNet)):
+            seen = (batch.shape[-2], batch.shape[-1])
+            maps += list(transient_probability(self.segmenter(batch), seen, seen))
+        return maps
 
     @torch.no_grad()
     def transient_mask(self, image: Tensor, size: tuple[int, int]) -> Tensor:
         """M (h, w) at `size` of one photo (3, h', w') in [0, 1]."""
-        maps = self.transient_maps(self.sized([image])[0])
-        return F.interpolate(maps, size=size, mode="bilinear", align_corners=False)[0, 0]
-
-    # -------------------------------------------------------------------------------------------------- photos
-
-    def sized(self, images: list[Tensor]) -> list[Tensor]:
-        """Photos (3, h, w) of any size -> batches (B, 3, h', w')."""
-        if self.spec.encoder == "compact":
-            return [at_size(images, COMPACT_SIZE)]
-        return [image[None] for image in images]
+        (found,) = self.transient_maps([image])
+        return F.interpolate(found[None], size=size, mode="bilinear", align_corners=False)[0, 0]
 
     # ----------------------------------------------------------------------------------------------- rendering
 
@@ -273,11 +261,20 @@ class SceneModel(nn.Module):
             parts.append(Rendering(*(x.float() for x in march.levels[-1].composite())))
         return Rendering(*(torch.cat(x) for x in zip(*parts, strict=True)))
 
+    def freeze_idle(self, weights: LossWeights) -> None:
+        """Parts whose only loss has weight 0 learn nothing; DDP must know that no gradient will come."""
+        if weights.content == 0 and self.content_encoder is not None:
+            self.content_encoder.requires_grad_(False)
+        if weights.interlevel == 0 and isinstance(self.field, HashField):
+            self.field.freeze_proposal()
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by the part whose learning rate they share: grid, field, appearance, transient."""
+        """Parameters that learn, by the part whose learning rate they share: grid, field, appearance, transient."""
         groups: dict[str, list[nn.Parameter]] = {"grid": [], "field": [], "appearance": [], "transient": []}
         for name, parameter in self.named_parameters():
             part = name.split(".")[0]
+            if not parameter.requires_grad:
+                continue
             if name.endswith("grid.table"):
                 groups["grid"].append(parameter)
             elif part == "segmenter":
@@ -287,6 +284,16 @@ class SceneModel(nn.Module):
             else:
                 groups["appearance"].append(parameter)
         return {name: group for name, group in groups.items() if group}
+
+
+def embed(encoder: nn.Module, images: list[Tensor]) -> Tensor:
+    """An encoder's maps (P, C, g, g) of photos (3, h, w) in [0, 1]."""
+    return torch.cat([encoder(batch) for batch in in_batches(images, isinstance(encoder, CompactEncoder))])
+
+
+def in_batches(images: list[Tensor], compact: bool) -> list[Tensor]:
+    """Photos (3, h, w) of any size as batches (B, 3, h', w'): all at one small size, or each at its own."""
+    return [at_size(images, COMPACT_SIZE)] if compact else [image[None] for image in images]
 
 
 def as_images(colours: Tensor) -> list[Tensor]:

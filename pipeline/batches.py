@@ -56,7 +56,7 @@ class TrainingPhotos:
         rays = Rays(origins.flatten(0, 1), directions.flatten(0, 1), near.flatten(), far.flatten())
         references = [self.reference(p.photo) for p in patches]
         others = [self.reference(p.other) for p in patches]
-        return Batch(rays, colours.to(self.device), positions.to(self.device), references, references, others)
+        return Batch(rays, colours.to(self.device), positions.to(self.device), references, others)
 
     def pixels(self, photo: int, rows: Tensor, cols: Tensor) -> Tensor:
         """Colours (N, 3) in [0, 1] at rows and columns of one training photo."""
@@ -73,33 +73,18 @@ def as_tensor(image: np.ndarray, device: torch.device) -> Tensor:
     return torch.from_numpy(np.array(image)).to(device).permute(2, 0, 1).float() / 255
 
 
-def augment(batch: Batch, jitter: float, crop: float, rng: np.random.Generator) -> Batch:
-    """More appearances than there are photos, and appearances that do not hang on what a photo shows.
+def jitter_colours(batch: Batch, strength: float, rng: np.random.Generator) -> Batch:
+    """Change each photo's exposure, white balance and contrast at random, in its patch and its reference alike.
 
-    Args:
-        jitter: strength of a random change of exposure, white balance and contrast, the same in a photo's patch and in
-            its references.
-        crop: smallest share of a reference's height and width that the encoder sees; the segmenter sees all of it.
+    A few dozen photos are few appearances for an encoder to learn from; these are more, and consistent.
     """
     device, count = batch.colours.device, len(batch.references)
-    draws = torch.from_numpy(rng.uniform(-jitter, jitter, (count, 5))).float().to(device)
+    draws = torch.from_numpy(rng.uniform(-strength, strength, (count, 5))).float().to(device)
     gain, gamma = torch.exp(draws[:, :1] + draws[:, 1:4]), torch.exp(draws[:, 4:])
 
     def change(colours: Tensor, i: int, shape: tuple[int, ...]) -> Tensor:
-        return (colours.clamp(min=1e-3).pow(gamma[i]) * gain[i].view(shape)).clamp(0, 1)
+        return (colours.pow(gamma[i]) * gain[i].view(shape)).clamp(0, 1)
 
+    colours = torch.stack([change(c, i, (1, 3)) for i, c in enumerate(batch.colours)])
     references = [change(r, i, (3, 1, 1)) for i, r in enumerate(batch.references)]
-    return batch._replace(
-        colours=torch.stack([change(c, i, (1, 3)) for i, c in enumerate(batch.colours)]),
-        references=references,
-        appearances=[random_window(r, crop, rng) for r in references],
-    )
-
-
-def random_window(image: Tensor, smallest: float, rng: np.random.Generator) -> Tensor:
-    """A random window (3, h', w') of a picture (3, h, w) whose sides are at least `smallest` of the picture's."""
-    (share_h, share_w), (place_h, place_w) = rng.uniform(smallest, 1, 2), rng.uniform(0, 1, 2)
-    height, width = image.shape[1:]
-    h, w = max(1, round(share_h * height)), max(1, round(share_w * width))
-    top, left = round(place_h * (height - h)), round(place_w * (width - w))
-    return image[:, top : top + h, left : left + w]
+    return batch._replace(colours=colours, references=references)

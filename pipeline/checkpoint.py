@@ -10,6 +10,7 @@ function of (seed, step, rank).
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import logging
@@ -53,7 +54,7 @@ def save_checkpoint(
     folder: Path, step: int, model: dict[str, Tensor], optimiser: dict[str, Any], meta: dict[str, Any]
 ) -> Path:
     """Write `folder/step-<step>`; it is committed when this returns, and absent or incomplete if it raises."""
-    target = folder / f"step-{step:08d}"
+    target = folder / folder_name(step)
     (target / META).unlink(missing_ok=True)  # an older try at the same step must not vouch for new files
     buffer = io.BytesIO()
     torch.save(optimiser, buffer)
@@ -61,8 +62,15 @@ def save_checkpoint(
     atomic_write(target / TRAINING, buffer.getvalue())
     record = {"format": FORMAT, "step": step, **meta}
     record["sha256"] = {name: sha256_of(target / name) for name in (MODEL, TRAINING)}
+    record["digest"] = digest(record)
     atomic_write(target / META, json.dumps(record, indent=2))
     return target
+
+
+def digest(record: dict[str, Any]) -> str:
+    """SHA-256 of a record without its own digest."""
+    content = {key: value for key, value in record.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def read_checkpoint(target: Path) -> Checkpoint:
@@ -75,8 +83,12 @@ def read_checkpoint(target: Path) -> Checkpoint:
         meta = json.loads((target / META).read_text())
         if meta["format"] != FORMAT:
             raise CheckpointError(f"{target / META}: format {meta['format']}, this version reads {FORMAT}")
-        for name, expected in meta["sha256"].items():
-            if name not in (MODEL, TRAINING) or sha256_of(target / name) != expected:
+        if meta["digest"] != digest(meta) or target.name != folder_name(meta["step"]):
+            raise CheckpointError(
+                f"{target / META}: its content is not what was written: damaged, or the folder renamed"
+            )
+        for name in (MODEL, TRAINING):
+            if sha256_of(target / name) != meta["sha256"][name]:
                 raise CheckpointError(f"{target / name}: its content does not agree with {META}: damaged")
         model = load_safetensors((target / MODEL).read_bytes())
         return Checkpoint(target, int(meta["step"]), model, meta)
@@ -86,18 +98,33 @@ def read_checkpoint(target: Path) -> Checkpoint:
         raise CheckpointError(f"{target}: cannot be read ({type(error).__name__}: {error})") from error
 
 
+def folder_name(step: int) -> str:
+    """The name of a checkpoint's folder."""
+    return f"step-{step:08d}"
+
+
 def committed(folder: Path) -> list[Path]:
     """Checkpoints that say that they are complete, oldest first; their hashes are not yet checked."""
     return sorted(p for p in folder.glob("step-????????") if (p / META).is_file())
 
 
 def latest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint that is whole; damaged ones are passed over with a warning."""
-    for target in reversed(committed(folder)):
+    """The newest checkpoint that is whole, None if there is none at all; damaged ones are passed over with a warning.
+
+    Raises:
+        CheckpointError: there are checkpoints, and every one of them is damaged.
+    """
+    targets = committed(folder)
+    for target in reversed(targets):
         try:
             return read_checkpoint(target)
         except CheckpointError as error:
-            log.warning("%s; using the checkpoint before it", error)
+            log.warning("%s; looking at the checkpoint before it", error)
+    if targets:
+        raise CheckpointError(
+            f"{folder}: all {len(targets)} checkpoints are damaged (see the warnings above); remove the folder to "
+            "train from the start"
+        )
     return None
 
 

@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.errors import CrossrayError
@@ -33,7 +34,9 @@ def main() -> None:
     try:
         app()
     except CrossrayError as error:
-        Console(stderr=True).print(f"[bold red]crossray:[/] {error}", highlight=False, soft_wrap=True, markup=True)
+        Console(stderr=True).print(
+            f"[bold red]crossray:[/] {escape(str(error))}", highlight=False, soft_wrap=True, markup=True
+        )
         sys.exit(2)
 
 

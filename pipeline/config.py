@@ -9,16 +9,21 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from model.losses import LossWeights
+from model.losses import LossWeights, check_weights
 from model.methods import METHODS, ModelSpec, check_spec
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.patches import PatchPlan
+
+UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+
+# Keys of `train` that decide what is kept and shown, not what is learned: they may change between two starts of a run.
+BOOKKEEPING = ("checkpoint_every", "keep_checkpoints", "log_every", "picture_every")
 
 
 class JobError(CrossrayError):
@@ -28,7 +33,7 @@ class JobError(CrossrayError):
 class Section(BaseModel):
     """A part of a job file; unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
 
 class SceneJob(Section):
@@ -42,6 +47,9 @@ class SceneJob(Section):
     """The appearance encoder and the segmenter see the original photo reduced by this factor."""
     shards: Path | None = None
     """Folder of the scene's shards; by default `shards/<scene>-R<downscale>` beside the runs."""
+
+
+Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 class LearningRates(Section):
@@ -62,7 +70,7 @@ class TrainJob(Section):
 
     epochs: int = Field(20, ge=1)
     """Epochs; an epoch has `steps_per_epoch` steps."""
-    steps_per_epoch: int | Literal["auto"] = "auto"
+    steps_per_epoch: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """`auto`: training pixels / (rays a step x ranks), rounded down."""
     seconds: float | None = Field(None, gt=0)
     """Train for this many seconds instead of `epochs`; the schedule stretches to fit. Not repeatable to the bit."""
@@ -70,7 +78,7 @@ class TrainJob(Section):
     """`auto`: bfloat16 inside the field where the hardware computes with it, else float32."""
     learning_rates: LearningRates = LearningRates()
     """By part of the model."""
-    adam_betas: tuple[float, float] = (0.9, 0.999)
+    adam_betas: tuple[Share, Share] = (0.9, 0.999)
     """Adam's running-average coefficients."""
     adam_epsilon: float = Field(1e-8, gt=0)
     """Adam's epsilon."""
@@ -84,8 +92,6 @@ class TrainJob(Section):
     """Share of the learning rate that the exponential decay ends at."""
     colour_jitter: float = Field(0.0, ge=0, lt=1)
     """Strength of a random colour change applied to a photo and its reference alike: more appearances than photos."""
-    reference_crop: float = Field(1.0, gt=0, le=1)
-    """Smallest share of a reference's sides that the encoder sees in training; 1 shows it the whole photo."""
     checkpoint_every: int = Field(5000, ge=1)
     """Steps between checkpoints; the last step is always kept."""
     keep_checkpoints: int = Field(5, ge=2)
@@ -153,14 +159,14 @@ RECIPES: dict[str, dict[str, Any]] = {
         "model": {"channels": 32, "encoder": "compact", "segmenter": "unet", "pixel_center": 0.5},
         "patch": {"size": 12, "photos": 4},
         "losses": {
-            "mask_start": 0.6,
-            "mask_end": 0.04,
+            "mask_start": 0.3,
+            "mask_end": 0.01,
             "mask_decay": 0.007,
             "appearance": 0.0,
             "content": 0.0,
         },
         "train": {
-            "learning_rates": {"grid": 0.03, "field": 0.004, "appearance": 0.0012, "transient": 0.001},
+            "learning_rates": {"grid": 0.02, "field": 0.004, "appearance": 0.0012, "transient": 0.001},
             "adam_betas": [0.9, 0.99],
             "adam_epsilon": 1e-15,
             "warmup_steps": 50,
@@ -183,7 +189,7 @@ def load_job(path: Path, settings: Sequence[str] = ()) -> Job:
         raw = yaml.safe_load(path.read_text())
     except OSError as error:
         raise JobError(f"{path}: cannot be read ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise JobError(f"{path}: not a YAML file: {error}") from error
     if not isinstance(raw, dict):
         raise JobError(f"{path}: a job file is a mapping of keys to values, not {type(raw).__name__}")
@@ -197,11 +203,23 @@ def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "j
     try:
         job = Job.model_validate(with_defaults(raw))
         check_spec(job.model)
+        check_weights(job.losses)
+        check_patch(job)
     except ValidationError as error:
         raise JobError("\n".join(f"{source}: {explain(e)}" for e in error.errors())) from None
     except ValueError as error:
         raise JobError(f"{source}: {error}") from None
     return job
+
+
+def check_patch(job: Job) -> None:
+    """Refuse patches that the appearance losses cannot encode: the released encoder halves a picture twice."""
+    encodes = job.model.appearance == "crossray" and job.model.encoder == "released"
+    if encodes and job.patch.size < 8 and (job.losses.appearance > 0 or job.losses.content > 0):
+        raise ValueError(
+            f"patch.size: {job.patch.size} is too small for the appearance losses with model.encoder: released, which "
+            "encode a rendered patch; at least 8"
+        )
 
 
 def save_job(job: Job, path: Path) -> None:
@@ -212,7 +230,7 @@ def save_job(job: Job, path: Path) -> None:
 def with_defaults(raw: dict[str, Any]) -> dict[str, Any]:
     """`raw` over the recipe of its field over the choices of its method."""
     name = raw.get("method", Job.model_fields["method"].default)
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         raise ValueError(f"method: {name!r} is not known{nearest(str(name), list(METHODS))}")
     axes = METHODS[name].axes() | {k: v for k, v in as_dict(raw.get("model")).items() if k in METHODS[name].axes()}
     recipe = RECIPES.get(str(axes["field"]), {})
@@ -228,7 +246,7 @@ def parse_setting(setting: str) -> dict[str, Any]:
         raise JobError(f"--set {setting}: write key=value, for example --set train.epochs=5")
     try:
         nested = yaml.safe_load(value)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise JobError(f"--set {setting}: {value!r} is not YAML: {error}") from error
     for part in reversed(key.strip().split(".")):
         nested = {part: nested}
@@ -251,9 +269,11 @@ def as_dict(value: Any) -> dict[str, Any]:
 
 def explain(error: Any) -> str:
     """One pydantic error as `key: what is wrong, nearest right name`."""
-    location = [str(part) for part in error["loc"] if part not in ("int", "literal['auto']")]
+    location = [str(part) for part in error["loc"]]
+    if location[-1] in ("int", "literal['auto']") and error["type"] not in UNKNOWN:  # branches of a union, not keys
+        location.pop()
     key = ".".join(location)
-    if error["type"] == "extra_forbidden" or error["type"] == "unexpected_keyword_argument":
+    if error["type"] in UNKNOWN:
         return f"{key}: there is no such key{nearest(location[-1], keys_at(location[:-1]))}"
     if error["type"] == "missing":
         return f"{key}: is missing"

@@ -36,6 +36,7 @@ from pipeline.train import device_name
 
 log = logging.getLogger("crossray")
 
+LPIPS_SIDE = 31  # pixels; AlexNet has nothing left of a smaller picture
 AFFINE = "+affine"  # suffix of the control: colours fitted to the photo's left half by one affine map
 
 
@@ -103,20 +104,14 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
     """
     protocol, downscale, affine = parse_protocol(protocol_name)
     job, model, checkpoint = load_run(run, step)
-    if downscale != job.scene.downscale:
-        raise CrossrayError(
-            f"protocol {protocol_name}: the run's shards {job.shards} are at R{job.scene.downscale}; "
-            f"evaluate under {protocol_name.split('@')[0]}@R{job.scene.downscale}, or train at R{downscale}"
-        )
+    check_downscale(job, protocol_name, downscale)
     torch.set_num_threads(max(job.threads, torch.get_num_threads()))
     photos = open_photos(job.shards)
     indices = photos.indices("test")
     if not indices:
         raise CrossrayError(f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table")
     out = run / "eval" / protocol_name / checkpoint.folder.name
-    lpips = find_lpips()
-    if lpips is None:
-        log.warning("LPIPS is left out: no weights found; CROSSRAY_LPIPS=/path/to/lpips_alex.npz names them")
+    lpips = usable_lpips(photos, indices)
 
     began = time.perf_counter()
     progress = Progress(f"evaluating {run.name} under {protocol_name}")
@@ -149,6 +144,19 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
     return result
 
 
+def usable_lpips(photos: Photos, indices: tuple[int, ...]) -> LPIPS | None:
+    """LPIPS where its weights are found and all pictures are large enough; else None, and the log says why."""
+    lpips = find_lpips()
+    if lpips is None:
+        log.warning("LPIPS is left out: no weights found; CROSSRAY_LPIPS=/path/to/lpips_alex.npz names them")
+        return None
+    for record in (photos.records[i] for i in indices):
+        if min(record.height, record.width // 2) < LPIPS_SIDE:
+            log.warning("LPIPS is left out: half of %s has a side under %d pixels", record.name, LPIPS_SIDE)
+            return None
+    return lpips
+
+
 def render_test_photo(model: SceneModel, photos: Photos, index: int, protocol: Protocol) -> tuple[View, np.ndarray]:
     """A photo's camera in the photo's own appearance, as far as the protocol lets the model see it."""
     reference = photos.reference(index)
@@ -170,7 +178,12 @@ def score(
     truth = photos.image(index)
     start = truth.shape[1] // 2 if protocol.scored == "right" else 0
     prediction, truth = np.ascontiguousarray(prediction[:, start:]), np.ascontiguousarray(truth[:, start:])
-    ssim = ssim_window3 if protocol.ssim == "window3" else ssim_11
+    ssim, least = (ssim_window3, 3) if protocol.ssim == "window3" else (ssim_11, 11)
+    if min(truth.shape[:2]) < least:
+        raise CrossrayError(
+            f"{photos.records[index].name}: its scored part is {truth.shape[1]} x {truth.shape[0]} pixels, smaller "
+            f"than the SSIM window of {least}; evaluate at a smaller downscale"
+        )
     row: dict[str, Any] = {
         "name": photos.records[index].name,
         "key": photos.records[index].key,
@@ -207,6 +220,21 @@ def save_png(path: Path, picture: np.ndarray) -> None:
     """A uint8 picture as PNG."""
     with atomic_file(path) as file:
         Image.fromarray(picture).save(file, format="PNG")
+
+
+def check_downscale(job: Job, protocol_name: str, downscale: int) -> None:
+    """CrossrayError where a protocol's pictures are not of the size of the job's photos."""
+    if downscale != job.scene.downscale:
+        raise CrossrayError(
+            f"protocol {protocol_name}: the photos of {job.name} are at R{job.scene.downscale}; "
+            f"evaluate under {protocol_name.split('@')[0]}@R{job.scene.downscale}, or train at R{downscale}"
+        )
+
+
+def check_protocols(job: Job) -> None:
+    """CrossrayError for a protocol that could only be refused after the training."""
+    for name in job.evaluate.protocols:
+        check_downscale(job, name, parse_protocol(name)[1])
 
 
 def run_protocols(job: Job) -> list[dict[str, Any]]:

@@ -34,7 +34,7 @@ log = logging.getLogger("crossray")
 
 TRAIN_SECONDS = 100.0
 SIZE = 128  # long side of a photo, pixels
-PHOTOS = {"train": 64, "val": 8, "test": 8}
+PHOTOS = {"train": 144, "val": 8, "test": 8}
 MASK_THRESHOLD = 0.5
 
 

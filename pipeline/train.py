@@ -24,10 +24,10 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
 from model.scene_model import SceneModel
-from pipeline.batches import TrainingPhotos, augment
+from pipeline.batches import TrainingPhotos, jitter_colours
 from pipeline.board import psnr_of, write_pictures, write_scalars
 from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
-from pipeline.config import Job, TrainJob
+from pipeline.config import BOOKKEEPING, Job, TrainJob
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.patches import patches, step_generator, steps_per_epoch
@@ -36,8 +36,9 @@ from pipeline.progress import Progress
 
 log = logging.getLogger("crossray")
 
-AUGMENTATION = 4  # keeps these draws apart from those of the patches
+JITTER = 4  # keeps these draws apart from those of the patches
 AGREE_EVERY = 10  # steps between the moments at which all ranks agree on time and on stopping
+SLOW_STEP = 1.0  # seconds; steps longer than this end with an agreement each, so that a stop is heard in time
 
 
 class TrainingError(CrossrayError):
@@ -100,10 +101,10 @@ def train(job: Job, context: Context) -> dict[str, Any]:
     resume(job, identity, model, optimiser, clock, context)
 
     lead = context.rank == 0
-    writer = SummaryWriter(str(job.run / "tensorboard"), purge_step=clock.step) if lead else None
+    writer = SummaryWriter(str(job.run / "tensorboard"), purge_step=clock.step + 1) if lead else None
     progress = Progress(f"training {job.name}", clock.progress, enabled=lead)
     rays_a_step = job.patch.photos * job.patch.size**2 * context.world_size
-    last_saved, stopped = clock.step, False
+    last_saved, stopped, slow = clock.step, False, False
     last_log = (clock.step, time.perf_counter())
     started = time.perf_counter() - clock.seconds
     while not clock.done:
@@ -111,8 +112,9 @@ def train(job: Job, context: Context) -> dict[str, Any]:
         terms, watched = training_step(ddp, optimiser, job, data, clock.step, epoch, context)
         clock.step += 1
 
-        if clock.step % AGREE_EVERY == 0 or (clock.total_steps == clock.step):
+        if slow or clock.step % AGREE_EVERY == 0 or clock.total_steps == clock.step:
             stopped, clock.seconds = agree(context, time.perf_counter() - started)
+            slow = clock.seconds / clock.step > SLOW_STEP
             progress.update(clock.progress, f"step {clock.step}  PSNR {psnr_of(watched['mse']):.1f}")
         save_now = clock.done or stopped or clock.step % job.train.checkpoint_every == 0
         log_now = clock.done or clock.step % job.train.log_every == 0
@@ -186,9 +188,9 @@ def forward(
     )
     generator = step_generator(job.patch.seed, step, context.rank, context.device)
     batch = data.batch(chosen, job.patch.size)
-    if job.train.colour_jitter > 0 or job.train.reference_crop < 1:
-        rng = np.random.default_rng((AUGMENTATION, job.patch.seed, step, context.rank))
-        batch = augment(batch, job.train.colour_jitter, job.train.reference_crop, rng)
+    if job.train.colour_jitter > 0:
+        rng = np.random.default_rng((JITTER, job.patch.seed, step, context.rank))
+        batch = jitter_colours(batch, job.train.colour_jitter, rng)
     return ddp(batch, step, generator, job.losses)
 
 
@@ -200,6 +202,7 @@ def build_model(job: Job, photos: Photos, device: torch.device) -> SceneModel:
     torch.manual_seed(job.patch.seed)
     model = SceneModel(job.model, torch.tensor(photos.manifest.scene.box)).to(device)
     model.use_bfloat16 = uses_bfloat16(job, device)
+    model.freeze_idle(job.losses)
     return model
 
 
@@ -214,12 +217,11 @@ def build_optimiser(model: SceneModel, train_job: TrainJob) -> torch.optim.Optim
 
 
 def distribute(model: SceneModel, context: Context) -> torch.nn.Module:
-    """DDP where there are several ranks. Buffers (running averages) never enter a gradient, so rank 0's are as good as
-    any and need not travel."""
+    """DDP where there are several ranks; buffers follow rank 0's."""
     if context.world_size == 1:
         return model
     devices = [context.device.index] if context.device.type == "cuda" else None
-    return DistributedDataParallel(model, device_ids=devices, broadcast_buffers=False)
+    return DistributedDataParallel(model, device_ids=devices)
 
 
 def warm_up(ddp: torch.nn.Module, job: Job, data: TrainingPhotos, epoch: int, context: Context) -> None:
@@ -264,7 +266,9 @@ def checkpoints(job: Job) -> Path:
 
 def run_identity(job: Job, photos: Photos) -> dict[str, str]:
     """What must agree for a checkpoint to be this run's: the photos, and all of the job that enters the result."""
-    relevant = job.model_dump(mode="json", include={"method", "model", "patch", "losses", "train"})
+    relevant = job.model_dump(
+        mode="json", include={"method", "model", "patch", "losses", "train"}, exclude={"train": set(BOOKKEEPING)}
+    )
     text = json.dumps(relevant, sort_keys=True)
     return {"shards": photos.manifest.content_hash, "job": hashlib.sha256(text.encode()).hexdigest()}
 
@@ -348,7 +352,7 @@ def check_finite(
         )
         names = sorted({data.photos.records[data.index[p.photo]].name for p in chosen})
         raise TrainingError(
-            f"step {step - 1}: {', '.join(bad)} not finite (photos of this rank: {', '.join(names)}). "
+            f"step {step - 1}: {', '.join(bad)} not finite (this rank's photos in this step: {', '.join(names)}). "
             f"The last good checkpoint is in {checkpoints(job)}; a lower learning rate is the usual cure"
         )
 

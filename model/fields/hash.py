@@ -61,13 +61,16 @@ class HashField(nn.Module):
         t, delta = 0.5 * (fine_edges[:, 1:] + fine_edges[:, :-1]), fine_edges.diff(dim=-1)
         density, features = self.density_and_features(points(rays, t))
         weights = render_weights(density, delta)
-        background = self.activate(
-            self.background(positional_encoding(rays.directions, DIRECTION_FREQUENCIES)).float()
-        )
+        background = self.activate(self.background(positional_encoding(rays.directions, DIRECTION_FREQUENCIES)).float())
         losses = {}
         if generator is not None:
             losses["interlevel"] = interlevel_loss(fine_edges, weights.detach(), edges, proposal_weights)
         return March([Level(t, weights, features, background)], losses)
+
+    def freeze_proposal(self) -> None:
+        """Without its loss the proposal stays as it is."""
+        self.proposal.requires_grad_(False)
+        self.proposal_grid.requires_grad_(False)
 
     def proposal_density(self, x: Tensor) -> Tensor:
         """Density (...,) of the proposal at points (..., 3)."""
@@ -90,14 +93,15 @@ class HashField(nn.Module):
     def contract(self, x: Tensor) -> Tensor:
         """Points (..., 3) in scene units -> [0, 1]^3: linear inside the box, 2 - 1/|x| outside, axis by axis."""
         low, high = self.box
-        x = (x - 0.5 * (low + high)) / (0.5 * (high - low))
+        x = (x - 0.5 * (low + high)) / (0.5 * (high - low)).clamp(min=1e-6)
         size = x.abs().clamp(min=1)
         return 0.25 * torch.where(x.abs() <= 1, x, x.sign() * (2 - 1 / size)) + 0.5
 
-    def resample(
-        self, edges: Tensor, weights: Tensor, count: int, generator: torch.Generator | None
-    ) -> Tensor:
-        """count + 1 edges (R, count + 1) from the histogram `weights` (R, S) over `edges` (R, S + 1)."""
+    def resample(self, edges: Tensor, weights: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        """count + 1 edges (R, count + 1) from the histogram `weights` (R, S) over `edges` (R, S + 1).
+
+        In training all quantiles move together by up to half a step, so the outermost edges may stop short of the ends.
+        """
         # The floor keeps every interval reachable: a field that the proposal misses could never be found again.
         histogram = weights + 0.01 / weights.shape[-1]
         u = torch.linspace(0, 1, count + 1, device=edges.device).expand(len(edges), -1)
@@ -127,7 +131,7 @@ def uniform_edges(near: Tensor, far: Tensor, count: int, generator: torch.Genera
 
 
 def interlevel_loss(edges: Tensor, weights: Tensor, outer_edges: Tensor, outer_weights: Tensor) -> Tensor:
-    """mean over rays of sum max(0, w - bound)^2 / w (mip-NeRF 360, Barron et al. 2022, eq. 13).
+    """mean over rays of sum max(0, w - bound)^2 / w (mip-NeRF 360, Barron et al. 2022, eq. 13; 1e-5 is added to w).
 
     `bound` is the total proposal weight of the intervals that overlap a field's interval: where the field sees matter,
     the proposal must have seen at least as much.

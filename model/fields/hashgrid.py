@@ -62,7 +62,8 @@ class HashEncoding(nn.Module):
         int32 throughout: on a CPU this arithmetic was six times faster than with int64.
         """
         scaled = x.t().contiguous()[:, None, :] * self.resolutions[None, :, None]  # (3, L, N)
-        low = scaled.int()
+        # A point at 1 belongs to the last cell: the next one would lie outside the grid.
+        low = torch.minimum(scaled, self.resolutions[None, :, None] - 1).int()
         fraction = scaled - low
         low_index = low * self.strides[:, :, None]
         index_at = (low_index, low_index + self.strides[:, :, None])
@@ -109,7 +110,5 @@ class _GatherCorners(torch.autograd.Function):
         flat = index.reshape(-1).long()
         # One flat scatter a feature: a 1-D scatter_add_ with int64 rows is the fast path on CPUs.
         planes = grad.t().contiguous()
-        columns = [
-            grad.new_zeros(rows).scatter_add_(0, flat, (weight * planes[f]).view(-1)) for f in range(features)
-        ]
+        columns = [grad.new_zeros(rows).scatter_add_(0, flat, (weight * planes[f]).view(-1)) for f in range(features)]
         return torch.stack(columns, dim=1), None, None

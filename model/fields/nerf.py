@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from model.fields.base import Level, March, Rays
 from model.fields.mlp import RadianceMLP
 from model.methods import MLPSpec
-from model.sampling import sample_pdf, stratified
+from model.sampling import refine, stratified
 from model.volume import intervals, render_weights
 
 
@@ -42,16 +42,14 @@ class NeRFField(nn.Module):
         t = stratified(rays.near, rays.far, num_coarse, jitter)
         coarse = self.level(self.coarse, rays, t, generator)
 
-        middle = 0.5 * (t[:, 1:] + t[:, :-1])
         u = None if generator is None else torch.rand(shape[0], num_fine, device=device, generator=generator)
-        new = sample_pdf(middle, coarse.weights[:, 1:-1].detach(), num_fine, u)
-        fine = self.level(self.fine, rays, torch.cat([t, new], dim=-1).sort(dim=-1).values, generator)
+        fine = self.level(self.fine, rays, refine(t, coarse.weights, num_fine, u), generator)
         return March([coarse, fine], {})
 
     def level(self, mlp: RadianceMLP, rays: Rays, t: Tensor, generator: torch.Generator | None) -> Level:
         """One MLP at distances t (R, S); in training its densities carry noise."""
         points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-        density, features = mlp(points, rays.directions[:, None].expand_as(points))
+        density, features = mlp(points, rays.directions[:, None])
         density = density.float()
         if generator is not None and self.spec.density_noise > 0:
             noise = torch.randn(density.shape, device=density.device, generator=generator)

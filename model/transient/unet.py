@@ -27,11 +27,13 @@ class UNet(nn.Module):
         self.up1 = block(5 * width, 2 * width)
         self.up2 = block(3 * width, width)
         self.out = nn.Conv2d(width, 4, 1)
-        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.weight)  # so the other layers begin to learn at the second step
         nn.init.constant_(self.out.bias, INITIAL_LOGIT)  # type: ignore[arg-type]
 
     def forward(self, image: Tensor) -> Tensor:
-        """Logits (B, 1, h, w) of images (B, 3, h, w) in [0, 1]; h and w are even."""
+        """Logits (B, 1, h, w) of images (B, 3, h, w) in [0, 1]; ValueError unless h and w are even."""
+        if image.ndim != 4 or image.shape[-2] % 2 or image.shape[-1] % 2:
+            raise ValueError(f"the U-Net reads (B, 3, h, w) with even sides, not {tuple(image.shape)}")
         fine = self.enter(F.pixel_unshuffle(image, 2))
         middle = self.down1(F.avg_pool2d(fine, 2, ceil_mode=True))
         coarse = self.down2(F.avg_pool2d(middle, 2, ceil_mode=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import uuid
@@ -30,6 +31,7 @@ def run_local(job: Job) -> dict[str, Any]:
 
 def run_ranks(job: Job) -> dict[str, Any]:
     """Several ranks as processes; if one fails, all are ended."""
+    from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
@@ -54,6 +56,11 @@ def run_ranks(job: Job) -> dict[str, Any]:
     )
     try:
         return elastic_launch(config, run_rank_of)(str(job_file))[0]
+    except SignalException:
+        try:
+            return json.loads((job.run / "training.json").read_text())
+        except FileNotFoundError:
+            raise CrossrayError(f"{job.run}: stopped before the first checkpoint") from None
     except ChildFailedError as error:
         rank, failure = error.get_first_failure()
         raise CrossrayError(f"training stopped: rank {rank} failed: {first_line(failure.message)}") from None

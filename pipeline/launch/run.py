@@ -9,9 +9,9 @@ from typing import Any
 import yaml
 from filelock import FileLock
 
-from pipeline.config import Job, save_job
+from pipeline.config import BOOKKEEPING, Job, save_job
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import run_protocols
+from pipeline.evaluate import check_protocols, run_protocols
 from pipeline.launch.local import run_local
 from pipeline.launch.tasks import ray_tasks
 from pipeline.launch.torchrun import run_rank
@@ -20,7 +20,7 @@ from pipeline.shards import Manifest, cut_shards, read_manifest
 log = logging.getLogger("crossray")
 
 # Keys that may change between two starts of one run: they decide where and when, not what comes out.
-FREE_KEYS = ("launcher", "device", "threads", "runs", "evaluate")
+FREE_KEYS = ("launcher", "device", "threads", "runs", "evaluate", *(f"train.{key}" for key in BOOKKEEPING))
 
 
 def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -32,6 +32,7 @@ def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     Raises:
         CrossrayError: anything that the user has to put right.
     """
+    check_protocols(job)
     claim_run(job)
     ensure_shards(job)
     if job.launcher == "torchrun":
@@ -58,7 +59,7 @@ def claim_run(job: Job) -> None:
             differs = [
                 f"  {key}: {before.get(key)!r} -> {now.get(key)!r}"
                 for key in sorted(before.keys() | now.keys())
-                if before.get(key) != now.get(key) and key.split(".")[0] not in FREE_KEYS
+                if before.get(key) != now.get(key) and not key.startswith(FREE_KEYS)
             ]
             if differs:
                 raise CrossrayError(
@@ -86,6 +87,11 @@ def ensure_shards(job: Job) -> Manifest:
     folder.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(folder.parent / f".{folder.name}.lock"):
         if not (folder / "manifest.json").is_file():
+            if not scene.path.is_dir():
+                raise CrossrayError(
+                    f"scene.path: {scene.path} is not a folder, and there are no shards in {folder}; "
+                    "--set scene.path=FOLDER names the posed scene"
+                )
             with ray_tasks() as mapper:
                 return cut_shards(
                     scene.path,

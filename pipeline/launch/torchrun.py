@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -78,4 +79,10 @@ def run_rank_of(job_file: str) -> dict[str, Any]:
     from pipeline.cli import set_up_logging
 
     set_up_logging()
-    return run_rank(load_job(Path(job_file)))
+    result = run_rank(load_job(Path(job_file)))
+    if not result["finished"]:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        # Asked to stop: the agent that started this rank reads no results any more, and a return would wait for it.
+        os._exit(0)
+    return result

@@ -54,12 +54,10 @@ def small_batch(patches: int = 2, k: int = 8, seed: int = 0) -> Batch:
     def photos(first: int) -> list[torch.Tensor]:
         return [torch.rand(3, *sizes[(first + i) % 3], generator=generator) for i in range(patches)]
 
-    references = photos(0)
     return Batch(
         rays=small_rays(patches * k * k, seed),
         colours=torch.rand(patches, k * k, 3, generator=generator),
         positions=torch.rand(patches, k * k, 2, generator=generator),
-        references=references,
-        appearances=[r[:, 1:-1, 2:] for r in references],  # parts, so that a mix-up shows
+        references=photos(0),
         others=photos(1),
     )

@@ -128,6 +128,14 @@ def test_embeddings_are_bounded():
     assert embedding.std() > 0.1
 
 
+def test_colours_enter_centred():
+    torch.manual_seed(0)
+    encoder = CompactEncoder(5)
+    for colour, value in ((0.5, 0.0), (1.0, 1.0), (0.0, -1.0)):
+        expected = encoder.layers(torch.full((1, 3, 16, 16), value))
+        torch.testing.assert_close(encoder(torch.full((1, 3, 16, 16), colour)), expected)
+
+
 def test_the_encoder_takes_photos_of_any_size_each_alone():
     torch.manual_seed(0)
     encoder, images = CompactEncoder(5), torch.rand(3, 3, 64, 96)

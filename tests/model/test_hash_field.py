@@ -158,10 +158,10 @@ def test_interlevel_loss_equals_the_slow_loop(low, high):
     assert loss.item() == pytest.approx(slow_interlevel(*fine, outer[0], 0.3 * outer[1]), rel=1e-4)
 
 
-def test_interlevel_loss_with_shared_edges():
-    """A proposal interval that only touches does not count."""
+@pytest.mark.parametrize("outer_weights", [[0.5, 0.1], [0.1, 0.5]])
+def test_a_proposal_interval_that_only_touches_does_not_count(outer_weights):
     edges = torch.tensor([[0.0, 1.0, 2.0]])
-    loss = interlevel_loss(edges, torch.tensor([[0.5, 0.5]]), edges, torch.tensor([[0.5, 0.1]]))
+    loss = interlevel_loss(edges, torch.tensor([[0.5, 0.5]]), edges, torch.tensor([outer_weights]))
     assert loss.item() == pytest.approx(0.4**2 / 0.5, rel=1e-3)
 
 

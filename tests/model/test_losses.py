@@ -127,8 +127,6 @@ def test_golden_gradients(golden):
             name = key.split("/")[-1]
             gradient = inputs[name].grad
             gradient = torch.zeros_like(expected) if gradient is None else gradient
-            torch.testing.assert_close(
-                gradient, expected, atol=1e-9, rtol=0, msg=lambda m, name=name: f"{name}: {m}"
-            )
+            torch.testing.assert_close(gradient, expected, atol=1e-9, rtol=0, msg=lambda m, name=name: f"{name}: {m}")
             checked += 1
     assert checked == 8

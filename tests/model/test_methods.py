@@ -65,31 +65,23 @@ def test_each_row_trains(row):
         assert parameter.grad.abs().sum() > 0, name
 
 
-@pytest.mark.parametrize("row", ["crossray", "crossray-compact", "crnerf"])
-def test_each_trainable_parameter_has_a_gradient_without_the_appearance_losses(row):
-    """The recipe of the fast field sets both weights to 0. Training on several ranks (DDP) fails at its second step
-    where a parameter that requires a gradient gets none, so E5, which only the content loss uses, must not require one.
-    """
-    model = small_model(row)
-    terms, _ = model(small_batch(), 0, seeded(), LossWeights(appearance=0.0, content=0.0))
-    torch.stack(list(terms.values())).sum().backward()
-    without = [name for name, p in model.named_parameters() if p.requires_grad and p.grad is None]
-    assert without == []
-
-
 @pytest.mark.parametrize("row", ROWS)
-def test_a_few_steps_lower_the_loss(row):
+def test_a_small_step_down_the_gradient_lowers_the_loss(row):
     model, batch = small_model(row), small_batch()
-    optimiser = torch.optim.Adam(model.parameters(), lr=3e-3)
-    losses = []
-    for _ in range(8):
-        terms, _ = model(batch, 0, seeded(), LossWeights())
-        total = torch.stack(list(terms.values())).sum()
-        optimiser.zero_grad()
-        total.backward()
-        optimiser.step()
-        losses.append(total.item())
-    assert losses[-1] < losses[0]
+
+    def total() -> torch.Tensor:
+        return torch.stack(list(model(batch, 0, seeded(), LossWeights())[0].values())).sum()
+
+    before = total()
+    before.backward()
+    gradients = [p.grad for p in model.parameters()]
+    length = torch.stack([g.square().sum() for g in gradients]).sum().sqrt()
+    with torch.no_grad():
+        for parameter, gradient in zip(model.parameters(), gradients, strict=True):
+            parameter -= 0.01 * gradient / length
+        after = total()
+    assert length > 1e-3
+    assert after < before
 
 
 def test_an_appearance_needs_a_decoder():
@@ -111,17 +103,16 @@ def test_the_released_encoder_has_64_channels():
 @pytest.mark.parametrize(
     "sizes",
     [
-        {"field": "mlp", "mlp": dataclasses.replace(MLP, coarse_samples=1)},
-        {"field": "mlp", "mlp": dataclasses.replace(MLP, width=0)},
+        {"mlp": dataclasses.replace(MLP, coarse_samples=1)},
         {"field": "hash", "hash": dataclasses.replace(HASH, levels=0)},
         {"field": "hash", "hash": dataclasses.replace(HASH, samples=0)},
         {"field": "hash", "hash": dataclasses.replace(HASH, min_resolution=64, max_resolution=8)},
         {"channels": 0, "encoder": "compact"},
     ],
-    ids=["one-coarse-sample", "no-width", "no-levels", "no-samples", "shrinking-grids", "no-channels"],
+    ids=["one-coarse-sample", "no-levels", "no-samples", "shrinking-grids", "no-channels"],
 )
 def test_sizes_that_cannot_work_are_refused(sizes):
-    """check_spec's docstring promises it; otherwise a job fails, or learns nothing, long after it was read."""
+    """check_spec's docstring promises it; otherwise the first step fails inside torch and names no key."""
     with pytest.raises(ValueError, match=r"model\."):
         check_spec(ModelSpec(**sizes))
 
@@ -139,6 +130,6 @@ def test_accepted_choices_read_photos_of_any_size(encoder, segmenter, appearance
         check_spec(spec)
     except ValueError:
         return
-    batch = small_batch()._replace(references=ODD, appearances=ODD, others=ODD[::-1])
+    batch = small_batch()._replace(references=ODD, others=ODD[::-1])
     terms, _ = SceneModel(spec, BOX)(batch, 0, seeded(), LossWeights())
     assert all(value.isfinite() for value in terms.values())

@@ -97,8 +97,8 @@ def test_fine_samples_go_where_the_coarse_level_sees_matter():
     zeros = torch.zeros(4, 3)
     rays = Rays(zeros, zeros + torch.tensor([0.0, 0.0, 1.0]), torch.zeros(4), torch.full((4,), 8.0))
     coarse, fine = field.march(rays).levels
-    # The coarse samples are 0.25 apart and the first one inside the wall, at 2.25, takes all the weight. Its bin reaches
-    # half way to its neighbours.
+    # The coarse samples are 0.25 apart, and the first one inside the wall, at 2.25, takes all the weight. Its bin
+    # reaches half way to its neighbours.
     in_bin = [((t > 2.12) & (t < 2.38)).sum(-1) for t in (coarse.t, fine.t)]
     assert (in_bin[0] == 1).all()
     assert (in_bin[1] - in_bin[0] >= 18).all()

@@ -91,8 +91,11 @@ def test_statistics_by_policy(row):
         assert torch.equal(patch_grid(4, 1.0, 0.0, 0.0, h, w)[0][::4], torch.tensor(rows))
         picked = torch.stack([features[r * w + c] for r in rows for c in cols])
         torch.testing.assert_close(patch, model.transform.content_statistics(picked[None]))
+        with pytest.raises(ValueError, match="not been trained"):
+            model.content_statistics(features, (h, w), "running")
         model.running_mean.normal_()
         model.running_gram.normal_()
+        model.running_count.fill_(1)
         running = model.content_statistics(features, (h, w), "running")
         assert torch.equal(running.mean, model.running_mean)
         assert torch.equal(running.gram, model.running_gram)
@@ -264,15 +267,16 @@ def slow_terms(model: SceneModel, batch: Batch, step: int, weights: LossWeights)
     for p in range(count):
         part = slice(p * n, (p + 1) * n)
         M, C = masks[p], batch.colours[p]
-        embedding, other = (model.encode([images[p]]) for images in (batch.appearances, batch.others))
+        embedding, other = (model.encode([images[p]]) for images in (batch.references, batch.others))
         levels = [level.composite().features[part][None] for level in march.levels]
         for name, F_cr, mask in zip(("coarse", "fine"), levels, (M.detach(), M), strict=True):
             picture = model.colours(F_cr, embedding)[0]
             add(name, 0.5 * ((1 - mask)[:, None] * (picture - C) ** 2).mean())
-        add("mask", max(6e-3, 5e-2 * 2.718281828**(-1e-3 * step)) * (M**2).mean())
+        add("mask", max(6e-3, 5e-2 * 2.718281828 ** (-1e-3 * step)) * (M**2).mean())
         add("embedding", weights.embedding * (embedding**2).mean())
+        other = other.detach()  # in T as well as in the loss: the released code's bank holds no gradient
         in_other = model.colours(levels[1], other)[0]
-        add("appearance", weights.appearance * (other.detach() - model.encode(image(in_other))).abs().mean())
+        add("appearance", weights.appearance * (other - model.encode(image(in_other))).abs().mean())
         plain, styled = model.decoder(levels[1])[0], model.colours(levels[1], embedding)[0]
         add("content", weights.content * ((content_features(plain) - content_features(styled)) ** 2).mean())
     return {name: torch.stack(values).mean() for name, values in per_patch.items()}
@@ -287,6 +291,11 @@ def test_the_terms_of_a_step_equal_the_table():
     for name, value in expected.items():
         torch.testing.assert_close(terms[name], value, atol=1e-6, rtol=1e-4, msg=lambda m, name=name: f"{name}: {m}")
     torch.testing.assert_close(watched["mask"], model.masks(batch).mean().detach())
+    torch.testing.assert_close(
+        *(torch.autograd.grad(t["appearance"], model.encoder.layers[0].weight)[0] for t in (terms, expected)),
+        atol=1e-8,  # what would come through the other photo's embedding is 8e-8, of gradients up to 1e-4
+        rtol=0,
+    )
 
 
 def test_gradients_of_the_appearance_terms_go_where_the_released_code_sends_them():

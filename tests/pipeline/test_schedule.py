@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -61,8 +62,8 @@ def test_exponential_starts_late_and_ends_at_the_floor():
     assert at(job, 2.0, 75, 100) == pytest.approx(2.0 * 0.2, rel=1e-12)  # sqrt(0.04), half-way through the decay
     assert learning_rate(2.0, job, 100, 1.0) == pytest.approx(0.08, rel=1e-12)
     late = [at(job, 2.0, step, 100) for step in range(50, 100)]
-    assert all(a > b for a, b in zip(late, late[1:], strict=False))
-    ratios = [b / a for a, b in zip(late, late[1:], strict=False)]
+    assert all(a > b for a, b in pairwise(late))
+    ratios = [b / a for a, b in pairwise(late)]
     assert ratios == pytest.approx([math.pow(0.04, 1 / 50)] * 49, rel=1e-9)
 
 

@@ -10,6 +10,8 @@ import torch
 from PIL import Image
 from tiny_scene import write_tiny_scene
 
+from pipeline import train as train_module
+from pipeline.checkpoint import latest_checkpoint
 from pipeline.config import Job, make_job, merge
 from pipeline.launch.tasks import in_process
 from pipeline.photos import Photos, open_photos
@@ -88,22 +90,18 @@ def tiny_photos(folder: Path) -> Photos:
 
 def train_until(job: Job, step: int) -> dict[str, Any]:
     """Train as one rank; the launcher asks to stop at the first agreement from `step` (a multiple of it) on."""
-    from pipeline.train import AGREE_EVERY
-
     asked = 0
 
-    def should_stop() -> bool:
+    def should_stop() -> bool:  # called at every agreement
         nonlocal asked
         asked += 1
-        return asked * AGREE_EVERY >= step
+        return asked * train_module.AGREE_EVERY >= step
 
     return train(job, Context(should_stop=should_stop))
 
 
 def final_state(job: Job) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Model tensors and optimiser state of the newest checkpoint."""
-    from pipeline.checkpoint import latest_checkpoint
-
     checkpoint = latest_checkpoint(checkpoints(job))
     assert checkpoint is not None
     return checkpoint.model, checkpoint.optimiser()

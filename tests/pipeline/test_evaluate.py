@@ -1,0 +1,325 @@
+"""Protocols: what they are called, what they read, and that the scores are those of the pictures that are written."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny_run import cut_tiny, tiny_job
+
+from pipeline import evaluate as module
+from pipeline.checkpoint import CheckpointError
+from pipeline.errors import CrossrayError
+from pipeline.evaluate import evaluate_run, fit_colours, load_run, parse_protocol, render_test_photo
+from pipeline.launch.run import claim_run
+from pipeline.metrics import ssim_11, ssim_window3
+from pipeline.photos import open_photos
+from pipeline.train import Context, train
+
+STEP = "step-00000006"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Finished runs on photos of 96 x 72 at R/2: `crossray` and `nerf`, six steps each."""
+    folder = cut_tiny(tmp_path_factory.mktemp("evaluate"), size=(98, 72))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CROSSRAY_CACHE", str(folder / "cache"))
+        for method in ("crossray", "nerf"):
+            job = tiny_job(folder, method, {"name": method, "train": {"epochs": 1, "checkpoint_every": 3}})
+            claim_run(job)
+            train(job, Context())
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _environment(trained, monkeypatch):
+    monkeypatch.setenv("CROSSRAY_CACHE", str(trained / "cache"))
+    monkeypatch.setattr(module, "find_lpips", lambda: None)
+
+
+@pytest.fixture
+def run(trained, tmp_path):
+    """run(method): a copy of a finished run, so that each test has its own eval folder."""
+
+    def of(method="crossray"):
+        return shutil.copytree(trained / "runs" / method, tmp_path / "runs" / method)
+
+    return of
+
+
+@pytest.fixture
+def photos(trained):
+    return open_photos(tiny_job(trained).shards)
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ("name", "appearance", "ssim", "downscale", "affine"),
+    [
+        ("crnerf-full@R4", "whole", "window3", 4, False),
+        ("crnerf-full@R2", "whole", "window3", 2, False),
+        ("nerfw-half@R1", "left", "window11", 1, False),
+        ("nerfw-half@R16+affine", "left", "window11", 16, True),
+    ],
+)
+def test_a_protocol_is_named_with_its_downscale(name, appearance, ssim, downscale, affine):
+    protocol, found_downscale, found_affine = parse_protocol(name)
+    assert (found_downscale, found_affine) == (downscale, affine)
+    assert (protocol.appearance, protocol.ssim) == (appearance, ssim)
+    assert (protocol.scored, protocol.rounding, protocol.mlp_samples) == ("right", "truncate", (256, 256))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["crnerf-full", "crnerf-full@", "crnerf-full@4", "crnerf-full@R0", "crnerf-full@R04", "crnerf-full@R4+afine", "",
+     "@R4", "crnerf-full@R4 ", "crnerf-full@R4\n", "CRNERF-FULL@R4", "../protocols/crnerf-full@R4"],
+)  # fmt: skip
+def test_a_bare_or_misspelt_name_says_how_to_write_it(name):
+    with pytest.raises(CrossrayError, match=r"crnerf-full@R4.*known: crnerf-full, nerfw-half"):
+        parse_protocol(name)
+
+
+def test_an_unknown_protocol_names_the_known_ones():
+    with pytest.raises(CrossrayError, match=r"'crnerf-ful' is not known \(known: crnerf-full, nerfw-half\)"):
+        parse_protocol("crnerf-ful@R4")
+
+
+# Scores
+
+
+def by_hand(folder, photos, index, start):
+    """Prediction and truth of the scored columns, from the PNG that was written."""
+    prediction = np.asarray(Image.open(folder / f"{photos.records[index].key}.png"))
+    truth = photos.image(index)
+    assert prediction.dtype == np.uint8
+    assert prediction.shape == truth.shape
+    return prediction[:, start:], truth[:, start:]
+
+
+@pytest.mark.parametrize(("name", "ssim"), [("crnerf-full@R2", ssim_window3), ("nerfw-half@R2", ssim_11)])
+@pytest.mark.parametrize("method", ["crossray", "nerf"])
+def test_scores_are_those_of_the_written_pictures(run, photos, name, ssim, method):
+    folder = run(method)
+    result = evaluate_run(folder, name)
+    out = folder / "eval" / name / STEP
+    assert json.loads((out / "metrics.json").read_text()) == result
+    (index,) = photos.indices("test")
+    record = photos.records[index]
+    prediction, truth = by_hand(out, photos, index, record.width // 2)
+    squared = (prediction / 255 - truth / 255) ** 2
+    (row,) = result["images"]
+    assert (row["name"], row["key"]) == (record.name, record.key)
+    assert row["psnr"] == pytest.approx(-10 * np.log10(squared.mean()), abs=1e-9)
+    assert row["ssim"] == pytest.approx(ssim(prediction, truth), abs=1e-9)
+    assert result["mean"] == {"psnr": row["psnr"], "ssim": row["ssim"]}
+    # The released evaluation samples the MLP field more densely than training does.
+    assert result["samples"] == ([256, 256] if method == "nerf" else "as in training")
+    written = {f"{record.key}.png", f"{record.key}.depth.png", "metrics.json"}
+    assert {p.name for p in out.iterdir()} == written
+
+
+def test_metrics_say_what_was_evaluated_and_how(run):
+    folder = run()
+    result = evaluate_run(folder, "crnerf-full@R2")
+    meta = json.loads((folder / "checkpoints" / STEP / "meta.json").read_text())
+    assert result["checkpoint_sha256"] == meta["sha256"]["model.safetensors"]
+    assert (result["protocol"], result["step"], result["method"]) == ("crnerf-full@R2", 6, "crossray")
+    assert result["definition"]["appearance"] == "whole"
+    assert {"torch", "numpy"} <= result["versions"].keys()
+
+
+def test_an_older_step_may_be_asked_for(run):
+    folder = run()
+    result = evaluate_run(folder, "crnerf-full@R2", step=3)
+    assert result["step"] == 3
+    assert (folder / "eval" / "crnerf-full@R2" / "step-00000003" / "metrics.json").is_file()
+    with pytest.raises(CheckpointError, match="step-00000004"):
+        evaluate_run(folder, "crnerf-full@R2", step=4)
+
+
+def test_metrics_come_last(run, monkeypatch):
+    """A folder without metrics.json is an evaluation that was interrupted."""
+    folder = run()
+    monkeypatch.setattr(module, "score", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_run(folder, "crnerf-full@R2")
+    assert not list(folder.rglob("metrics.json"))
+
+
+def test_twice_is_the_same(run):
+    folder = run()
+    first, again = (evaluate_run(folder, "crnerf-full@R2") for _ in range(2))
+    assert first["images"] == again["images"]
+
+
+def test_a_moved_run_finds_its_own_checkpoints_and_shards(run, trained):
+    assert load_run(run())[0].shards == trained / "shards" / "tiny"
+
+
+def test_another_downscale_is_refused(run):
+    with pytest.raises(CrossrayError, match=r"crnerf-full@R4.*at R2.*crnerf-full@R2"):
+        evaluate_run(run(), "crnerf-full@R4")
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    with pytest.raises(CrossrayError, match=r"is not a run: it has no job\.yaml"):
+        evaluate_run(tmp_path, "crnerf-full@R2")
+
+
+def test_a_run_without_a_checkpoint_is_refused(run):
+    folder = run()
+    shutil.rmtree(folder / "checkpoints")
+    with pytest.raises(CheckpointError, match="no committed checkpoint"):
+        evaluate_run(folder, "crnerf-full@R2")
+
+
+# What a protocol lets the model see
+
+
+class Doctored:
+    """Photos with another reference for one of them."""
+
+    def __init__(self, photos, index, reference):
+        self.records, self.index, self.doctored, self.image = photos.records, index, reference, photos.image
+        self.original = photos.reference
+
+    def reference(self, i):
+        return self.doctored if i == self.index else self.original(i)
+
+
+@pytest.fixture(scope="module")
+def responsive(trained):
+    """The trained model, its transform pushed so far that appearance visibly acts, after six steps already."""
+    _, model, _ = load_run(trained / "runs" / "crossray")
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for layer in model.transform.shift:
+            if hasattr(layer, "weight"):
+                layer.weight.copy_(torch.randn(layer.weight.shape, generator=generator))
+    return model
+
+
+def predict(model, photos, index, name):
+    return render_test_photo(model, photos, index, parse_protocol(name)[0])[1]
+
+
+def test_the_left_half_protocol_does_not_see_the_right_half(responsive, photos):
+    (index,) = photos.indices("test")
+    reference = photos.reference(index)
+    half = reference.shape[1] - reference.shape[1] // 2
+    doctored = reference.copy()
+    doctored[:, half:] = 255 - doctored[:, half:]
+    other = Doctored(photos, index, doctored)
+    before, after = (predict(responsive, p, index, "nerfw-half@R2") for p in (photos, other))
+    np.testing.assert_array_equal(before, after)
+    before, after = (predict(responsive, p, index, "crnerf-full@R2") for p in (photos, other))
+    assert np.abs(before - after).max() > 1e-3  # the paper's protocol does see it
+
+
+def test_the_left_half_protocol_does_see_the_left_half(responsive, photos):
+    (index,) = photos.indices("test")
+    doctored = photos.reference(index).copy()
+    doctored[:, : doctored.shape[1] // 2] = 0
+    before, after = (
+        predict(responsive, p, index, "nerfw-half@R2") for p in (photos, Doctored(photos, index, doctored))
+    )
+    assert np.abs(before - after).max() > 1e-3
+
+
+# The affine control
+
+
+def smooth(shape, seed):
+    return np.random.default_rng(seed).uniform(0.2, 0.6, shape)
+
+
+@pytest.mark.parametrize("width", [40, 41])
+def test_a_known_affine_map_is_recovered(width):
+    picture = smooth((20, width, 3), 0)
+    matrix = np.array([[0.9, 0.1, 0.0], [0.05, 0.7, 0.1], [0.0, 0.2, 1.1]])
+    photo = np.rint(255 * (picture @ matrix + [0.05, 0.1, -0.02])).astype(np.uint8)
+    np.testing.assert_allclose(fit_colours(picture, photo), photo / 255, atol=0.003)  # the photo's rounding
+
+
+@pytest.mark.parametrize("width", [40, 41])
+def test_the_fit_never_looks_at_the_right_half(width):
+    picture, photo = smooth((20, width, 3), 1), np.random.default_rng(2).integers(0, 256, (20, width, 3), np.uint8)
+    changed = photo.copy()
+    changed[:, width - width // 2 :] = 255 - changed[:, width - width // 2 :]
+    np.testing.assert_array_equal(fit_colours(picture, photo), fit_colours(picture, changed))
+    changed = photo.copy()
+    changed[:, : width // 2] = 255 - changed[:, : width // 2]
+    assert np.abs(fit_colours(picture, photo) - fit_colours(picture, changed)).max() > 0.01
+
+
+def test_the_fit_is_the_least_squares_one():
+    picture, photo = smooth((12, 16, 3), 3), np.random.default_rng(4).integers(0, 256, (12, 16, 3), np.uint8)
+    left = slice(None, 8)
+    target = photo[:, left] / 255
+    best = np.square(fit_colours(picture, photo)[:, left] - target).mean()
+    ones = np.ones((12, 8, 1))
+    design = np.concatenate([picture[:, left], ones], axis=-1).reshape(-1, 4)
+    # Normal equations: slow, and obviously right.
+    solution = np.linalg.solve(design.T @ design, design.T @ target.reshape(-1, 3))
+    assert best == pytest.approx(np.square(design @ solution - target.reshape(-1, 3)).mean(), rel=1e-9)
+
+
+def test_the_affine_control_scores_the_fitted_picture(run, photos):
+    folder = run()
+    plain, fitted = (evaluate_run(folder, name) for name in ("nerfw-half@R2", "nerfw-half@R2+affine"))
+    assert fitted["protocol"] == "nerfw-half@R2+affine"
+    assert (folder / "eval" / "nerfw-half@R2+affine" / STEP / "metrics.json").is_file()
+    assert fitted["mean"]["psnr"] > plain["mean"]["psnr"]  # after six steps, any fit is better
+    (index,) = photos.indices("test")
+    prediction, truth = by_hand(folder / "eval" / "nerfw-half@R2+affine" / STEP, photos, index, 49 // 2)
+    assert fitted["mean"]["psnr"] == pytest.approx(-10 * np.log10(np.square(prediction / 255 - truth / 255).mean()))
+
+
+# LPIPS
+
+
+def test_lpips_is_left_out_with_a_warning_where_there_are_no_weights(run, monkeypatch):
+    said = []
+    monkeypatch.setattr(module.log, "warning", lambda text, *values: said.append(text % values))
+    result = evaluate_run(run(), "crnerf-full@R2")
+    assert "lpips" not in result["mean"]
+    assert len(said) == 1
+    assert "CROSSRAY_LPIPS" in said[0]
+
+
+@pytest.mark.real
+def test_lpips_is_scored_with_the_real_weights(trained, test_data, tmp_path, monkeypatch):
+    from pipeline.lpips import find_lpips
+
+    weights = test_data / "lpips" / "lpips_alex.npz"
+    monkeypatch.setattr(module, "find_lpips", lambda: find_lpips(weights))
+    folder = cut_tiny(tmp_path, size=(140, 80))
+    job = tiny_job(folder, "crossray", {"train": {"epochs": 1, "steps_per_epoch": 1}})
+    claim_run(job)
+    train(job, Context())
+    result = evaluate_run(job.run, "crnerf-full@R2")
+    photos = open_photos(job.shards)
+    (index,) = photos.indices("test")
+    prediction, truth = by_hand(job.run / "eval" / "crnerf-full@R2" / "step-00000001", photos, index, 35)
+    lpips = find_lpips(weights)
+    assert lpips is not None
+    expected = lpips.distance(np.ascontiguousarray(prediction), np.ascontiguousarray(truth))
+    assert result["mean"]["lpips"] == pytest.approx(expected, rel=1e-6)
+    assert 0 < result["mean"]["lpips"] < 2
+
+
+@pytest.mark.real
+def test_pictures_too_small_for_lpips_are_said(run, test_data, monkeypatch):
+    """The scored half of the tiny photo is 25 pixels wide; AlexNet needs 31."""
+    from pipeline.lpips import find_lpips
+
+    monkeypatch.setattr(module, "find_lpips", lambda: find_lpips(test_data / "lpips" / "lpips_alex.npz"))
+    with pytest.raises(CrossrayError, match=r"photo_003\.jpg.*31"):
+        evaluate_run(run(), "crnerf-full@R2")

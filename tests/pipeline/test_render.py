@@ -1,0 +1,154 @@
+"""Views: a ray a pixel, features once, colours for any appearance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from model.methods import METHODS, HashSpec, MLPSpec, ModelSpec
+from model.scene_model import SceneModel
+from pipeline.render import colour_view, read_appearance, render_view, view_rays
+from pipeline.shards import CameraRecord
+
+CPU = torch.device("cpu")
+MLP = MLPSpec(width=16, coarse_samples=6, fine_samples=6)
+HASH = HashSpec(levels=3, log2_entries=8, max_resolution=32, width=16, proposal_samples=8, samples=6)
+
+# 9 x 7 pixels from (0.5, 0, -3) along +z, turned a little about y, with its middle off the picture's.
+TURN = 0.3
+CAMERA = CameraRecord(
+    key="view", name="view.jpg", image_id=1, split="test", width=9, height=7, fx=10.0, fy=11.0, cx=4.0, cy=3.75,
+    c2w=((np.cos(TURN), 0, np.sin(TURN), 0.5), (0, 1, 0, 0), (-np.sin(TURN), 0, np.cos(TURN), -3)),
+    near=1.0, far=6.0, source_sha256="0" * 64,
+)  # fmt: skip
+
+
+def small_model(row: str = "crnerf", **changes) -> SceneModel:
+    torch.manual_seed(0)
+    spec = ModelSpec(**(METHODS[row].axes() | {"mlp": MLP, "hash": HASH} | changes))
+    model = SceneModel(spec, torch.tensor([[-1.0, -1, -1], [1, 1, 1]])).eval()
+    for name, parameter in model.named_parameters():
+        if name.endswith("grid.table"):
+            torch.nn.init.normal_(parameter)
+    return model
+
+
+def photo(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (17, 22, 3), np.uint8)
+
+
+@pytest.mark.parametrize("pixel_center", [0.0, 0.5])
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_rays_by_hand(stride, pixel_center):
+    rays = view_rays(CAMERA, pixel_center, CPU, stride)
+    rows = {1: range(7), 2: (1, 3, 5), 3: (1, 4)}[stride]
+    cols = {1: range(9), 2: (1, 3, 5, 7), 3: (1, 4, 7)}[stride]
+    pixels = [(row, col) for row in rows for col in cols]
+    assert len(rays.near) == len(pixels)
+    c2w = np.array(CAMERA.c2w)
+    for n, (row, col) in enumerate(pixels):
+        direction = c2w[:, :3] @ [(col + pixel_center - 4.0) / 10, (row + pixel_center - 3.75) / 11, 1]
+        np.testing.assert_allclose(rays.directions[n], direction / np.linalg.norm(direction), atol=1e-6)
+        np.testing.assert_allclose(rays.origins[n], [0.5, 0, -3], atol=1e-6)
+    assert rays.near.tolist() == [1.0] * len(pixels)
+    assert rays.far.tolist() == [6.0] * len(pixels)
+
+
+@pytest.mark.parametrize("row", METHODS)
+def test_a_view_has_its_shapes_and_no_chunks(row):
+    model = small_model(row)
+    view = render_view(model, CAMERA)
+    assert view.size == (7, 9)
+    assert view.features.shape == (63, 3 if row == "nerf" else 64)
+    assert view.depth.shape == view.accumulation.shape == (7, 9)
+    assert view.accumulation.min() >= 0
+    assert view.accumulation.max() <= 1 + 1e-5
+    assert view.depth.max() <= 6 + 1e-4
+    in_parts = render_view(model, CAMERA, chunk=10)
+    for a, b in zip(in_parts[1:], view[1:], strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
+    assert not view.features.requires_grad
+
+
+@pytest.mark.parametrize("row", ["crnerf", "crossray"])
+def test_a_strided_view_is_part_of_the_full_one(row):
+    model = small_model(row)
+    full, part = render_view(model, CAMERA), render_view(model, CAMERA, stride=2)
+    assert part.size == (3, 4)
+    expected = full.features.view(7, 9, -1)[1::2, 1::2].flatten(0, 1)
+    torch.testing.assert_close(part.features, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(part.depth, full.depth[1::2, 1::2], atol=1e-5, rtol=0)
+
+
+def test_the_method_s_pixel_centre_is_used():
+    released, middle = (render_view(small_model(pixel_center=c), CAMERA) for c in (0.0, 0.5))
+    shifted = CAMERA.model_copy(update={"cx": CAMERA.cx - 0.5, "cy": CAMERA.cy - 0.5})
+    torch.testing.assert_close(
+        render_view(small_model(pixel_center=0.0), shifted).features, middle.features, atol=1e-5, rtol=0
+    )
+    assert (released.features - middle.features).abs().max() > 1e-4
+
+
+def test_sample_counts_are_passed_on():
+    model = small_model()
+    more = render_view(model, CAMERA, samples=(12, 12))
+    assert (more.features - render_view(model, CAMERA).features).abs().max() > 1e-5
+    same = render_view(model, CAMERA, samples=(6, 6))
+    torch.testing.assert_close(same.features, render_view(model, CAMERA).features, atol=1e-6, rtol=0)
+
+
+def test_an_appearance_is_the_encoder_s_view_of_the_photo():
+    model = small_model()
+    appearance = read_appearance(model, photo(0))
+    assert not appearance.requires_grad
+    as_input = torch.from_numpy(photo(0)).permute(2, 0, 1)[None] / 255
+    with torch.no_grad():
+        torch.testing.assert_close(appearance, model.encoder(as_input))
+    assert read_appearance(small_model("nerf"), photo(0)) is None
+
+
+@pytest.mark.parametrize("row", METHODS)
+def test_pictures_are_colours(row):
+    model = small_model(row)
+    picture = colour_view(model, render_view(model, CAMERA), read_appearance(model, photo(0)))
+    assert picture.shape == (7, 9, 3)
+    assert picture.dtype == np.float32
+    assert picture.min() >= 0
+    assert picture.max() <= 1
+
+
+def test_one_rendering_many_appearances():
+    model = small_model()
+    view = render_view(model, CAMERA)
+    first, second = (read_appearance(model, photo(seed)) for seed in (0, 1))
+    pictures = [colour_view(model, view, a) for a in (first, second)]
+    assert np.abs(pictures[0] - pictures[1]).max() > 1e-6
+    # Each as if it had been rendered and coloured on its own, in row order.
+    with torch.no_grad():
+        expected = model.colours(view.features[None], second)[0]
+    np.testing.assert_allclose(pictures[1].reshape(-1, 3), expected, atol=1e-5)
+
+
+def test_policies_differ_where_statistics_do():
+    model = small_model()
+    model.track(torch.rand(1, 50, 64, generator=torch.Generator().manual_seed(0)))
+    view, appearance = render_view(model, CAMERA), read_appearance(model, photo(0))
+    content = {
+        policy: model.content_statistics(view.features, view.size, policy) for policy in ("view", "patch", "running")
+    }
+    for policy, statistics in content.items():
+        with torch.no_grad():
+            expected = model.colours(view.features[None], appearance, statistics)[0].view(7, 9, 3)
+        np.testing.assert_allclose(colour_view(model, view, appearance, policy), expected, atol=1e-6)
+    assert (content["view"].mean - content["running"].mean).abs().max() > 1e-3
+
+
+def test_the_running_policy_does_not_look_at_the_view():
+    """So that a film does not flicker: the colour of a ray does not depend on what else is in the picture."""
+    model = small_model()
+    model.track(torch.rand(1, 50, 64, generator=torch.Generator().manual_seed(0)))
+    appearance = read_appearance(model, photo(0))
+    full, part = render_view(model, CAMERA), render_view(model, CAMERA, stride=2)
+    pictures = [colour_view(model, v, appearance, "running") for v in (full, part)]
+    np.testing.assert_allclose(pictures[1], pictures[0][1::2, 1::2], atol=1e-5)
