@@ -39,6 +39,7 @@ StatisticsPolicy = Literal["view", "patch", "running"]
 
 COMPACT_SIZE = (64, 96)  # height and width at which the compact encoder and the U-Net see a photo
 RUNNING_MOMENTUM = 0.01
+RENDER_POINTS = 2**18  # points that go through a field at once when no gradient is needed
 
 
 class Batch(NamedTuple):
@@ -252,8 +253,12 @@ class SceneModel(nn.Module):
     # ----------------------------------------------------------------------------------------------- rendering
 
     @torch.no_grad()
-    def render(self, rays: Rays, chunk: int = 4096, samples: tuple[int, int] | None = None) -> Rendering:
-        """Features, depth and accumulation of R rays, `chunk` at a time; memory grows with the chunk, not the view."""
+    def render(self, rays: Rays, chunk: int | None = None, samples: tuple[int, int] | None = None) -> Rendering:
+        """Features, depth and accumulation of R rays, `chunk` at a time; without a number, as many as RENDER_POINTS
+        allows. Beside the result, memory holds one chunk, whatever the view's size: an activation of the paper's MLP
+        is RENDER_POINTS x 256 floats (0.27 GB), and a few of them live at once.
+        """
+        chunk = chunk or max(1, RENDER_POINTS // self.field.points_a_ray(samples))
         parts = []
         for start in range(0, len(rays.near), chunk):
             with self.autocast(rays.near.device):

@@ -63,6 +63,25 @@ def quickstart(
 
 
 @app.command()
+def landmark(
+    out: Annotated[Path, typer.Argument(help="Folder for the scene.")],
+    train: Annotated[int, typer.Option(help="Training photos.")] = 48,
+    val: Annotated[int, typer.Option(help="Validation photos.")] = 8,
+    test: Annotated[int, typer.Option(help="Test photos.")] = 8,
+    size: Annotated[int, typer.Option(help="Long side of a photo, pixels.")] = 128,
+    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
+    sun_jitter: Annotated[float, typer.Option(help="Degrees by which the sun moves between photos.")] = 0.0,
+) -> None:
+    """Make the built-in scene: photos "in the wild" of a rendered landmark, with the truth beside them."""
+    from pipeline.landmark import write_landmark
+    from pipeline.launch.tasks import ray_tasks
+
+    with ray_tasks() as mapper:
+        write_landmark(out, train=train, val=val, test=test, size=size, seed=seed, sun_jitter=sun_jitter, mapper=mapper)
+    print_line(f"{out}: {train + val + test} photos; crossray run jobs/train_scene_cpu.yaml --set scene.path={out}")
+
+
+@app.command()
 def run(
     job: Annotated[Path, typer.Argument(help="A job file, for example jobs/train_scene.yaml.")],
     settings: Settings = [],  # noqa: B006 (typer reads it once)

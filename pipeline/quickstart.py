@@ -27,7 +27,7 @@ from pipeline.landmark import Landmark, write_landmark
 from pipeline.metrics import psnr, ssim_11, to_8bit
 from pipeline.photos import Photos, open_photos
 from pipeline.render import View, colour_view, read_appearance, render_view
-from pipeline.report import Row, write_report
+from pipeline.report import Row, write_overview, write_report
 from pipeline.shards import cut_shards
 
 log = logging.getLogger("crossray")
@@ -105,7 +105,9 @@ def run_quickstart(
         "photos": photos,
         "size": size,
     }
-    report = write_report(out / "report.html", summary, scene.rows())
+    rows = scene.rows()
+    write_overview(out / "overview.png", rows)
+    report = write_report(out / "report.html", summary, rows)
     summary["total_seconds"] = time.perf_counter() - began
     atomic_write(out / "summary.json", json.dumps(summary, indent=2))
     print_summary(console, out, summary, report)
@@ -122,7 +124,7 @@ class Scored:
         self.nerf: SceneModel = load_run(nerf.run)[1]
 
     def test_scores(self) -> dict[str, float]:
-        """Means over the test views of what the issue of a quick start is: see docs/quickstart.md for each."""
+        """Means over the test views; docs/quickstart.md defines each."""
         test = self.photos.indices("test")
         scores: dict[str, list[float]] = {k: [] for k in ("psnr", "psnr_cross", "psnr_floor", "psnr_nerf", "ssim")}
         for position, index in enumerate(test):
@@ -158,16 +160,16 @@ class Scored:
         for index in (*test[:: max(1, len(test) // 3)][:3], *crowded):
             name, camera = self.name(index), self.photos.records[index]
             view = render_view(self.model, camera)
-            lent = test[-1] if index != test[-1] else test[0]
+            lent = max(test, key=lambda i: self.distance(i, index))
             rows.append(
                 Row(
-                    title=f"{camera.split} photo {camera.name}",
+                    title=f"{camera.split} photo {camera.name} (other light: {self.name(lent)})",
                     pictures={
                         "photo": self.photos.image(index),
                         "clean truth": self.landmark.truth(name, name),
                         "NeRF, same budget": self.nerf_picture(index),
                         "Crossray": self.coloured(view, self.photos.reference(index)),
-                        f"in the light of {self.name(lent)}": self.coloured(view, self.photos.reference(lent)),
+                        "in another photo's light": self.coloured(view, self.photos.reference(lent)),
                         "predicted mask": to_8bit(self.predicted_mask(index), "round"),
                         "true mask": self.landmark.mask(name).astype(np.uint8) * 255,
                         "depth": depth_picture(view),
@@ -175,6 +177,11 @@ class Scored:
                 )
             )
         return rows
+
+    def distance(self, a: int, b: int) -> float:
+        """How far apart the mean colours of two photos are."""
+        means = [self.photos.reference(i).mean(axis=(0, 1)) for i in (a, b)]
+        return float(np.linalg.norm(means[0] - means[1]))
 
     def name(self, index: int) -> str:
         """The photo's file name."""

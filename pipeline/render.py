@@ -43,7 +43,7 @@ def render_view(
     camera: CameraRecord,
     *,
     stride: int = 1,
-    chunk: int = 4096,
+    chunk: int | None = None,
     samples: tuple[int, int] | None = None,
 ) -> View:
     """Features, depth and accumulation of a whole view. Memory: the features, and the samples of one chunk."""

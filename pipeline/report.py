@@ -1,4 +1,4 @@
-"""report.html: one self-contained page with the scores and the pictures, readable offline and on a phone."""
+"""What a run looks like: report.html, one self-contained page for a browser or a phone, and its pictures as a PNG."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from PIL import Image
 
-from pipeline.files import atomic_write
+from pipeline.files import atomic_file, atomic_write
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
 
 STYLE = """
 :root { color-scheme: light dark; --line: #8884; }
@@ -55,6 +59,23 @@ def write_report(path: Path, summary: dict[str, Any], rows: list[Row]) -> Path:
         f"<table>{scores}</table>{views}</html>"
     )
     atomic_write(path, page)
+    return path
+
+
+def write_overview(path: Path, rows: list[Row]) -> Path:
+    """The pictures of the rows as one PNG, a column each kind; returns its path."""
+    titles = list(rows[0].pictures)
+    shape = (len(rows), len(titles))
+    figure, axes = plt.subplots(*shape, figsize=(2 * shape[1], 1.6 * shape[0]), squeeze=False, layout="constrained")
+    for row, line in zip(rows, axes, strict=True):
+        for axis, picture in zip(line, row.pictures.values(), strict=True):
+            axis.imshow(picture, cmap="gray", vmin=0, vmax=255)
+            axis.set_axis_off()
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=10)
+    with atomic_file(path) as file:
+        figure.savefig(file, format="png", dpi=100)
+    plt.close(figure)
     return path
 
 

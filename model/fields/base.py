@@ -54,6 +54,10 @@ class March(NamedTuple):
 class Field(Protocol):
     """(x, d) -> density, feature, along rays, with its own way of choosing samples."""
 
+    def points_a_ray(self, samples: tuple[int, int] | None = None) -> int:
+        """Points at which the field is evaluated for each ray, at most, in one pass of its networks."""
+        ...
+
     def march(
         self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
     ) -> March:

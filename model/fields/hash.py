@@ -48,6 +48,10 @@ class HashField(nn.Module):
         self.trunk = mlp(self.grid.out_channels, spec.width, 1 + channels)
         self.background = mlp(3 * (1 + 2 * DIRECTION_FREQUENCIES), 32, channels)
 
+    def points_a_ray(self, samples: tuple[int, int] | None = None) -> int:
+        """See Field."""
+        return max(samples or (self.spec.proposal_samples, self.spec.samples))
+
     def march(
         self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
     ) -> March:

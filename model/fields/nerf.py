@@ -31,6 +31,10 @@ class NeRFField(nn.Module):
         self.coarse = RadianceMLP(channels, **sizes)
         self.fine = RadianceMLP(channels, **sizes)
 
+    def points_a_ray(self, samples: tuple[int, int] | None = None) -> int:
+        """See Field: the fine MLP sees both kinds of samples."""
+        return sum(samples or (self.spec.coarse_samples, self.spec.fine_samples))
+
     def march(
         self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
     ) -> March:
