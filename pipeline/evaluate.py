@@ -12,6 +12,7 @@ import logging
 import platform
 import re
 import time
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -148,13 +149,19 @@ def usable_lpips(photos: Photos, indices: tuple[int, ...]) -> LPIPS | None:
     """LPIPS where its weights are found and all pictures are large enough; else None, and the log says why."""
     lpips = find_lpips()
     if lpips is None:
-        log.warning("LPIPS is left out: no weights found; CROSSRAY_LPIPS=/path/to/lpips_alex.npz names them")
+        warn_once("LPIPS is left out: no weights found; CROSSRAY_LPIPS=/path/to/lpips_alex.npz names them")
         return None
     for record in (photos.records[i] for i in indices):
         if min(record.height, record.width // 2) < LPIPS_SIDE:
-            log.warning("LPIPS is left out: half of %s has a side under %d pixels", record.name, LPIPS_SIDE)
+            warn_once(f"LPIPS is left out: half of {record.name} has a side under {LPIPS_SIDE} pixels")
             return None
     return lpips
+
+
+@cache
+def warn_once(text: str) -> None:
+    """A warning that several evaluations share."""
+    log.warning(text)
 
 
 def render_test_photo(model: SceneModel, photos: Photos, index: int, protocol: Protocol) -> tuple[View, np.ndarray]:

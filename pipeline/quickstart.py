@@ -21,6 +21,7 @@ from rich.table import Table
 from model.scene_model import SceneModel
 from pipeline.batches import as_tensor
 from pipeline.config import Job, make_job, save_job
+from pipeline.errors import CrossrayError
 from pipeline.evaluate import depth_picture, load_run
 from pipeline.files import atomic_write
 from pipeline.landmark import Landmark, write_landmark
@@ -90,6 +91,8 @@ def run_quickstart(
         console.rule(f"{number}/4  training {job.name}: {ranks} processes, {seconds:.0f} s")
         save_job(job, job.run / "job.yaml")
         trained[job.name] = train(job)
+        if not trained[job.name]["finished"]:
+            raise CrossrayError(f"training {job.name} was stopped; the same command again goes on from where it was")
     console.rule("4/4  evaluation and report")
     torch.set_num_threads(ranks)
     scene = Scored(out, ours, nerf)

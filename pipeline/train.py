@@ -23,14 +23,14 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
-from model.scene_model import SceneModel
+from model.scene_model import Batch, SceneModel
 from pipeline.batches import TrainingPhotos, jitter_colours
 from pipeline.board import psnr_of, write_pictures, write_scalars
 from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
 from pipeline.config import BOOKKEEPING, Job, TrainJob
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
-from pipeline.patches import patches, step_generator, steps_per_epoch
+from pipeline.patches import Patch, patches, step_generator, steps_per_epoch
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
 
@@ -53,6 +53,49 @@ class Context:
     world_size: int = 1
     device: torch.device = torch.device("cpu")
     should_stop: Callable[[], bool] = lambda: False
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a rank does in each step: fixed for the whole run, and a pure function of the step."""
+
+    job: Job
+    context: Context
+    data: TrainingPhotos
+    steps_per_epoch: int
+
+    def patches(self, step: int) -> list[Patch]:
+        """Which patches this rank sees in a step."""
+        return patches(
+            self.job.patch,
+            self.data.sizes,
+            step=step,
+            rank=self.context.rank,
+            world_size=self.context.world_size,
+            steps_per_epoch=self.steps_per_epoch,
+        )
+
+    def batch(self, step: int) -> Batch:
+        """The pixels, rays and references of these patches."""
+        batch = self.data.batch(self.patches(step), self.job.patch.size)
+        strength = self.job.train.colour_jitter
+        if strength == 0:
+            return batch
+        return jitter_colours(batch, strength, np.random.default_rng((JITTER, self.seed, step, self.context.rank)))
+
+    def generator(self, step: int) -> torch.Generator:
+        """The source of everything else that is drawn in a step."""
+        return step_generator(self.seed, step, self.context.rank, self.context.device)
+
+    @property
+    def seed(self) -> int:
+        """Of everything that is drawn."""
+        return self.job.patch.seed
+
+    @property
+    def rays_a_step(self) -> int:
+        """Over all ranks."""
+        return self.job.patch.photos * self.job.patch.size**2 * self.context.world_size
 
 
 @dataclass
@@ -89,27 +132,26 @@ def train(job: Job, context: Context) -> dict[str, Any]:
     torch.set_num_threads(job.threads)
     photos = open_photos(job.shards)
     data = TrainingPhotos(photos, context.device, job.model.pixel_center)
-    epoch = epoch_length(job, data.sizes, context.world_size)
+    work = Work(job, context, data, epoch_length(job, data.sizes, context.world_size))
     model = build_model(job, photos, context.device)
     optimiser = build_optimiser(model, job.train)
     seconds = job.train.seconds
-    clock = Clock(None if seconds else job.train.epochs * epoch, seconds)
+    clock = Clock(None if seconds else job.train.epochs * work.steps_per_epoch, seconds)
     identity = run_identity(job, photos)
     ddp = distribute(model, context)
     if context.world_size > 2:
-        warm_up(ddp, job, data, epoch, context)
+        warm_up(work, ddp)
     resume(job, identity, model, optimiser, clock, context)
 
     lead = context.rank == 0
     writer = SummaryWriter(str(job.run / "tensorboard"), purge_step=clock.step + 1) if lead else None
     progress = Progress(f"training {job.name}", clock.progress, enabled=lead)
-    rays_a_step = job.patch.photos * job.patch.size**2 * context.world_size
     last_saved, stopped, slow = clock.step, False, False
     last_log = (clock.step, time.perf_counter())
     started = time.perf_counter() - clock.seconds
     while not clock.done:
         set_learning_rates(optimiser, job.train, clock)
-        terms, watched = training_step(ddp, optimiser, job, data, clock.step, epoch, context)
+        terms, watched = training_step(work, ddp, optimiser, clock.step)
         clock.step += 1
 
         if slow or clock.step % AGREE_EVERY == 0 or clock.total_steps == clock.step:
@@ -119,9 +161,9 @@ def train(job: Job, context: Context) -> dict[str, Any]:
         save_now = clock.done or stopped or clock.step % job.train.checkpoint_every == 0
         log_now = clock.done or clock.step % job.train.log_every == 0
         if save_now or log_now:
-            check_finite(terms, model, clock.step, data, job, epoch, context)
+            check_finite(work, terms, model, clock.step - 1)
         if writer is not None and log_now:
-            rate = (clock.step - last_log[0]) * rays_a_step / (time.perf_counter() - last_log[1])
+            rate = (clock.step - last_log[0]) * work.rays_a_step / (time.perf_counter() - last_log[1])
             write_scalars(writer, clock.step, terms, watched, optimiser, rate)
             last_log = (clock.step, time.perf_counter())
         if writer is not None and (clock.step % job.train.picture_every == 0 or clock.done):
@@ -146,8 +188,8 @@ def train(job: Job, context: Context) -> dict[str, Any]:
         "train_seconds": clock.seconds,
         "ranks": context.world_size,
         "finished": clock.done,
-        "steps_per_epoch": epoch,
-        "rays_a_step": rays_a_step,
+        "steps_per_epoch": work.steps_per_epoch,
+        "rays_a_step": work.rays_a_step,
         "device": device_name(context.device),
         "bfloat16": model.use_bfloat16,
         "parameters": sum(p.numel() for p in model.parameters()),
@@ -158,40 +200,19 @@ def train(job: Job, context: Context) -> dict[str, Any]:
 
 
 def training_step(
-    ddp: torch.nn.Module,
-    optimiser: torch.optim.Optimizer,
-    job: Job,
-    data: TrainingPhotos,
-    step: int,
-    epoch: int,
-    context: Context,
+    work: Work, ddp: torch.nn.Module, optimiser: torch.optim.Optimizer, step: int
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """One optimisation step; its draws depend on (seed, step, rank) alone."""
-    terms, watched = forward(ddp, job, data, step, epoch, context)
+    """One optimisation step; returns the loss terms and what is worth watching."""
+    terms, watched = forward(work, ddp, step)
     optimiser.zero_grad(set_to_none=True)
     torch.stack(list(terms.values())).sum().backward()
     optimiser.step()
     return {k: v.detach() for k, v in terms.items()}, watched
 
 
-def forward(
-    ddp: torch.nn.Module, job: Job, data: TrainingPhotos, step: int, epoch: int, context: Context
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def forward(work: Work, ddp: torch.nn.Module, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """The loss terms of one step of this rank."""
-    chosen = patches(
-        job.patch,
-        data.sizes,
-        step=step,
-        rank=context.rank,
-        world_size=context.world_size,
-        steps_per_epoch=epoch,
-    )
-    generator = step_generator(job.patch.seed, step, context.rank, context.device)
-    batch = data.batch(chosen, job.patch.size)
-    if job.train.colour_jitter > 0:
-        rng = np.random.default_rng((JITTER, job.patch.seed, step, context.rank))
-        batch = jitter_colours(batch, job.train.colour_jitter, rng)
-    return ddp(batch, step, generator, job.losses)
+    return ddp(work.batch(step), step, work.generator(step), work.job.losses)
 
 
 # ------------------------------------------------------------------------------------------------------ set-up
@@ -224,7 +245,7 @@ def distribute(model: SceneModel, context: Context) -> torch.nn.Module:
     return DistributedDataParallel(model, device_ids=devices)
 
 
-def warm_up(ddp: torch.nn.Module, job: Job, data: TrainingPhotos, epoch: int, context: Context) -> None:
+def warm_up(work: Work, ddp: torch.nn.Module) -> None:
     """Two backward passes whose gradients are dropped.
 
     DDP orders its buckets anew after the first one, and with more than two ranks the order of a sum changes its last
@@ -232,7 +253,7 @@ def warm_up(ddp: torch.nn.Module, job: Job, data: TrainingPhotos, epoch: int, co
     """
     before = {name: buffer.clone() for name, buffer in ddp.named_buffers()}
     for _ in range(2):
-        terms, _ = forward(ddp, job, data, 0, epoch, context)
+        terms, _ = forward(work, ddp, 0)
         torch.stack(list(terms.values())).sum().backward()
         ddp.zero_grad(set_to_none=True)
     for name, buffer in ddp.named_buffers():
@@ -333,27 +354,16 @@ def agree(context: Context, seconds: float) -> tuple[bool, float]:
     return bool(shared[0] > 0), float(shared[1])
 
 
-def check_finite(
-    terms: dict[str, Tensor],
-    model: SceneModel,
-    step: int,
-    data: TrainingPhotos,
-    job: Job,
-    epoch: int,
-    context: Context,
-) -> None:
+def check_finite(work: Work, terms: dict[str, Tensor], model: SceneModel, step: int) -> None:
     """Stop before numbers that are not finite reach a checkpoint."""
     bad = [f"the loss {name}" for name, value in terms.items() if not math.isfinite(float(value))]
     bad += [f"the weights {name}" for name, value in model.named_parameters() if not bool(value.isfinite().all())][:3]
     if bad:
-        world = context.world_size
-        chosen = patches(
-            job.patch, data.sizes, step=step - 1, rank=context.rank, world_size=world, steps_per_epoch=epoch
-        )
-        names = sorted({data.photos.records[data.index[p.photo]].name for p in chosen})
+        records = work.data.photos.records
+        names = sorted({records[work.data.index[p.photo]].name for p in work.patches(step)})
         raise TrainingError(
-            f"step {step - 1}: {', '.join(bad)} not finite (this rank's photos in this step: {', '.join(names)}). "
-            f"The last good checkpoint is in {checkpoints(job)}; a lower learning rate is the usual cure"
+            f"step {step}: {', '.join(bad)} not finite (this rank's photos in this step: {', '.join(names)}). "
+            f"The last good checkpoint is in {checkpoints(work.job)}; a lower learning rate is the usual cure"
         )
 
 

@@ -21,11 +21,12 @@ def run_local(job: Job) -> dict[str, Any]:
         CrossrayError: a rank failed; its own message stands above.
     """
     if job.ranks == 1:
-        previous = signal.getsignal(signal.SIGTERM)
+        previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             return train(job, Context(device=pick_device(job, 0), should_stop=StopFlag().install()))
         finally:
-            signal.signal(signal.SIGTERM, previous)
+            for number, handler in previous.items():
+                signal.signal(number, handler)
     return run_ranks(job)
 
 
@@ -35,7 +36,6 @@ def run_ranks(job: Job) -> dict[str, Any]:
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-    pick_device(job, job.ranks - 1)  # refuse before anything is started
     # A rank waiting for another one must not spin on the core that the other needs.
     for name, value in (("OMP_NUM_THREADS", str(job.threads)), ("OMP_WAIT_POLICY", "PASSIVE")):
         os.environ.setdefault(name, value)

@@ -14,7 +14,7 @@ from pipeline.errors import CrossrayError
 from pipeline.evaluate import check_protocols, run_protocols
 from pipeline.launch.local import run_local
 from pipeline.launch.tasks import ray_tasks
-from pipeline.launch.torchrun import run_rank
+from pipeline.launch.torchrun import pick_device, run_rank
 from pipeline.shards import Manifest, cut_shards, read_manifest
 
 log = logging.getLogger("crossray")
@@ -33,6 +33,8 @@ def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         CrossrayError: anything that the user has to put right.
     """
     check_protocols(job)
+    if job.launcher == "local":
+        pick_device(job, job.ranks - 1)  # a job that wants more than there is says so before anything is started
     claim_run(job)
     ensure_shards(job)
     if job.launcher == "torchrun":

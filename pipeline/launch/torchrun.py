@@ -17,15 +17,21 @@ from pipeline.train import Context, train
 
 
 class StopFlag:
-    """Set by SIGTERM: the ranks agree on it, write a checkpoint and return."""
+    """Set by SIGTERM or Ctrl-C: the ranks agree on it, write a checkpoint and return. A second Ctrl-C ends at once."""
 
     def __init__(self) -> None:
         self.set = False
 
     def install(self) -> StopFlag:
-        """Listen for SIGTERM from now on."""
-        signal.signal(signal.SIGTERM, lambda *_: setattr(self, "set", True))
+        """Listen from now on."""
+        signal.signal(signal.SIGTERM, self.stop)
+        signal.signal(signal.SIGINT, self.stop)
         return self
+
+    def stop(self, number: int, frame: object) -> None:
+        """The handler."""
+        self.set = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def __call__(self) -> bool:
         return self.set
@@ -39,7 +45,10 @@ def pick_device(job: Job, local_rank: int) -> torch.device:
     """
     available = torch.cuda.is_available()
     if job.device == "cuda" and not available:
-        raise CrossrayError("device: cuda, but torch sees no GPU here; --set device=cpu trains on the processor")
+        raise CrossrayError(
+            "device: cuda, but torch sees no GPU here; jobs/train_scene_cpu.yaml is made for training without one, and "
+            "--set device=cpu runs any job on the processor"
+        )
     if job.device == "cpu" or not available:
         return torch.device("cpu")
     if local_rank >= torch.cuda.device_count():
@@ -47,7 +56,6 @@ def pick_device(job: Job, local_rank: int) -> torch.device:
             f"ranks: rank {local_rank} of this machine has no GPU of its own ({torch.cuda.device_count()} here); "
             f"--set ranks={torch.cuda.device_count()} fits"
         )
-    torch.cuda.set_device(local_rank)
     return torch.device("cuda", local_rank)
 
 
@@ -67,6 +75,8 @@ def run_rank(job: Job) -> dict[str, Any]:
     if world != job.ranks:
         raise CrossrayError(f"ranks: the job wants {job.ranks}, torchrun started {world}; --set ranks={world} fits")
     device = pick_device(job, local_rank)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
     try:
         return train(job, Context(rank, world, device, StopFlag().install()))

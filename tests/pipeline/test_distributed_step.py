@@ -9,7 +9,7 @@ from tiny_run import cut_tiny, tiny_job, tiny_photos
 
 from model.methods import METHODS
 from pipeline.batches import TrainingPhotos
-from pipeline.train import Context, build_model, distribute, forward
+from pipeline.train import Context, Work, build_model, distribute, forward
 
 CONTEXT = Context(rank=0, world_size=2)  # so that the model is wrapped
 
@@ -40,8 +40,9 @@ def test_every_method_takes_several_steps(cut, group, method, losses):
     photos = tiny_photos(cut)
     data = TrainingPhotos(photos, CONTEXT.device, job.model.pixel_center)
     ddp = distribute(build_model(job, photos, CONTEXT.device), CONTEXT)
+    work = Work(job, CONTEXT, data, steps_per_epoch=6)
     for step in range(3):
-        terms, _ = forward(ddp, job, data, step, 6, CONTEXT)
+        terms, _ = forward(work, ddp, step)
         total = torch.stack(list(terms.values())).sum()
         total.backward()
         assert total.isfinite()

@@ -160,10 +160,10 @@ def test_sigterm_to_one_rank_stops_it_and_gives_the_signal_back(cut, monkeypatch
     job = tiny_job(cut, "nerf", {"name": "alone", "train": {"epochs": 4}})
     step = train_module.training_step
 
-    def interrupted(ddp, optimiser, job, data, number, epoch, context):
+    def interrupted(work, ddp, optimiser, number):
         if number == 3:
             signal.raise_signal(signal.SIGTERM)
-        return step(ddp, optimiser, job, data, number, epoch, context)
+        return step(work, ddp, optimiser, number)
 
     monkeypatch.setattr(train_module, "training_step", interrupted)
     before = signal.getsignal(signal.SIGTERM)

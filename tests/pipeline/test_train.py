@@ -278,8 +278,8 @@ def test_a_gradient_that_is_not_finite_never_reaches_a_checkpoint(make, monkeypa
     """The loss of the last step is fine, and its gradient is not: only the weights tell."""
     step = module.training_step
 
-    def poison(ddp, optimiser, job, data, number, epoch, context):
-        found = step(ddp, optimiser, job, data, number, epoch, context)
+    def poison(work, ddp, optimiser, number):
+        found = step(work, ddp, optimiser, number)
         if number == 11:
             with torch.no_grad():
                 next(ddp.parameters()).fill_(math.nan)
@@ -295,11 +295,11 @@ def test_a_gradient_that_is_not_finite_never_reaches_a_checkpoint(make, monkeypa
 def test_the_last_good_checkpoint_survives_and_is_named(make, monkeypatch):
     step = module.training_step
 
-    def poison(ddp, optimiser, job, data, number, epoch, context):
+    def poison(work, ddp, optimiser, number):
         if number == 7:
             with torch.no_grad():
                 next(ddp.parameters()).fill_(math.nan)
-        return step(ddp, optimiser, job, data, number, epoch, context)
+        return step(work, ddp, optimiser, number)
 
     monkeypatch.setattr(module, "training_step", poison)
     job = make("nerf", log_every=1, checkpoint_every=2)
