@@ -37,6 +37,16 @@ TRAIN_SECONDS = 100.0
 SIZE = 128  # long side of a photo, pixels
 PHOTOS = {"train": 144, "val": 8, "test": 8}
 MASK_THRESHOLD = 0.5
+SCORES = {
+    "psnr": "test views in their own light, against the truth without tourists [dB]",
+    "psnr_cross": "the same, the light read from another view [dB]",
+    "psnr_nerf": "plain NeRF: same field, processes and seconds [dB]",
+    "psnr_floor": "the true view's mean colour [dB]",
+    "ssim": "structural similarity, 11 x 11",
+    "mask_iou": "tourists found, intersection over union",
+    "train_seconds": "training of Crossray [s]",
+    "total_seconds": "everything [s]",
+}
 
 
 def quickstart_job(out: Path, method: str, ranks: int, seconds: float) -> Job:
@@ -110,8 +120,9 @@ def run_quickstart(
     }
     rows = scene.rows()
     write_overview(out / "overview.png", rows)
-    report = write_report(out / "report.html", summary, rows)
     summary["total_seconds"] = time.perf_counter() - began
+    scores = [(key, f"{summary[key]:.3f}", text) for key, text in SCORES.items()]
+    report = write_report(out / "report.html", "Crossray: the landmark without its tourists", scores, rows)
     atomic_write(out / "summary.json", json.dumps(summary, indent=2))
     print_summary(console, out, summary, report)
     return summary
@@ -208,17 +219,7 @@ class Scored:
 def print_summary(console: Console, out: Path, summary: dict[str, Any], report: Path) -> None:
     """The table at the end, and what to do next."""
     table = Table("score", "value", "what it is", title="Crossray quickstart")
-    lines = {
-        "psnr": "test views in their own light, against the truth without tourists [dB]",
-        "psnr_cross": "the same, the light read from another view [dB]",
-        "psnr_nerf": "plain NeRF: same field, processes and seconds [dB]",
-        "psnr_floor": "the true view's mean colour [dB]",
-        "ssim": "structural similarity, 11 x 11",
-        "mask_iou": "tourists found, intersection over union",
-        "train_seconds": "training of Crossray [s]",
-        "total_seconds": "everything [s]",
-    }
-    for key, text in lines.items():
+    for key, text in SCORES.items():
         table.add_row(key, f"{summary[key]:.3f}" if summary[key] < 1 else f"{summary[key]:.2f}", text)
     console.print(table)
     console.print(f"pictures:     {report.resolve()}", soft_wrap=True)

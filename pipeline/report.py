@@ -7,7 +7,6 @@ import html
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -38,13 +37,15 @@ class Row:
     pictures: dict[str, np.ndarray]
 
 
-def write_report(path: Path, summary: dict[str, Any], rows: list[Row]) -> Path:
-    """Write the page; returns its path."""
-    scores = "".join(
-        f"<tr><td>{html.escape(key)}</td><td>{value:.3f}</td></tr>"
-        for key, value in summary.items()
-        if isinstance(value, float)
-    )
+def write_report(path: Path, title: str, scores: list[tuple[str, str, str]], rows: list[Row]) -> Path:
+    """Write the page; returns its path.
+
+    Args:
+        title: the heading.
+        scores: name, value, and what it is.
+        rows: the pictures.
+    """
+    table = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in line) + "</tr>" for line in scores)
     views = "".join(
         f"<h2>{html.escape(row.title)}</h2><div class=row>"
         + "".join(figure(caption, picture) for caption, picture in row.pictures.items())
@@ -54,9 +55,8 @@ def write_report(path: Path, summary: dict[str, Any], rows: list[Row]) -> Path:
     page = (
         "<!doctype html><html lang=en><meta charset=utf-8>"
         "<meta name=viewport content='width=device-width, initial-scale=1'>"
-        f"<title>Crossray</title><style>{STYLE}</style>"
-        "<h1>Crossray: the landmark without its tourists</h1>"
-        f"<table>{scores}</table>{views}</html>"
+        f"<title>{html.escape(title)}</title><style>{STYLE}</style>"
+        f"<h1>{html.escape(title)}</h1><table>{table}</table>{views}</html>"
     )
     atomic_write(path, page)
     return path

@@ -16,8 +16,9 @@ def test_the_page_holds_the_scores_and_the_pictures_to_the_pixel(tmp_path):
     colour = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
     gray = colour[..., 0]
     rows = [Row("view <1>", {"photo": colour, "depth & mask": gray})]
-    page = write_report(tmp_path / "report.html", {"psnr": 22.5, "ranks": 2}, rows).read_text()
-    assert "<td>psnr</td><td>22.500</td>" in page
+    page = write_report(tmp_path / "report.html", "A <title>", [("psnr", "22.500", "what & why")], rows).read_text()
+    assert "<td>psnr</td><td>22.500</td><td>what &amp; why</td>" in page
+    assert "<h1>A &lt;title&gt;</h1>" in page
     assert "view &lt;1&gt;" in page
     assert "depth &amp; mask" in page
     found = [np.asarray(Image.open(io.BytesIO(base64.b64decode(d)))) for d in re.findall(r"base64,([^']+)'", page)]
@@ -27,6 +28,8 @@ def test_the_page_holds_the_scores_and_the_pictures_to_the_pixel(tmp_path):
 
 
 def test_the_page_asks_for_nothing_else(tmp_path):
-    page = write_report(tmp_path / "new" / "report.html", {}, [Row("a", {"b": np.zeros((2, 2), np.uint8)})]).read_text()
+    page = write_report(
+        tmp_path / "new" / "report.html", "t", [], [Row("a", {"b": np.zeros((2, 2), np.uint8)})]
+    ).read_text()
     assert not re.search(r"https?://|src='(?!data:)|<script|<link", page)
     assert "name=viewport" in page
