@@ -45,7 +45,7 @@ class HashSpec:
 
     __pydantic_config__ = STRICT
 
-    levels: int = 8
+    levels: int = 12
     """Levels of the grid."""
     log2_entries: int = 15
     """Base-2 logarithm of the table entries a level."""

@@ -269,7 +269,8 @@ def epoch_length(job: Job, sizes: np.ndarray, world_size: int) -> int:
 
 def uses_bfloat16(job: Job, device: torch.device) -> bool:
     """Whether the field computes in bfloat16. `auto`: on GPUs that have it; on CPUs with bfloat16 instructions for the
-    big MLPs of the paper, but not for the small ones of the fast field, where it was measured to gain nothing."""
+    paper's MLPs, whose step it halves, but not for the fast field, where it gains a tenth at most
+    (benchmarks/results/precision.json)."""
     if job.train.precision != "auto":
         return job.train.precision == "bfloat16"
     if device.type == "cuda":
