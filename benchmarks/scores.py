@@ -1,5 +1,10 @@
-"""The README's table of scores, from runs that are there: records them with the machine, then prints the table.
+r"""The README's table of scores, from runs that are there: records them with the machine, then prints the table.
 
+    crossray quickstart
+    jobs/train_scene_cpu.yaml --set scene.path=reichstag --set name=reichstag-R8
+    jobs/train_scene_cpu.yaml --set scene.path=reichstag --set name=reichstag-R8-nerf --set method=nerf \
+        --set model.field=hash --set "evaluate.protocols=[crnerf-full@R8,nerfw-half@R8,crnerf-full@R8+affine,\
+nerfw-half@R8+affine]"
     python benchmarks/scores.py --quickstart quickstart --crossray runs/reichstag-R8 --nerf runs/reichstag-R8-nerf \
         --out benchmarks/results/scores.json
 

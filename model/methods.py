@@ -133,17 +133,22 @@ LEAST = {  # sizes below these have no meaning
 }
 
 
+MOST = {"hash.levels": 32, "hash.log2_entries": 24, "hash.max_resolution": 2**16, "channels": 4096, "mlp.width": 2**16}
+
+
 def check_spec(spec: ModelSpec) -> None:
     """Refuse choices that do not fit together, with the reason.
 
     Raises:
         ValueError: an appearance that has no decoder to act on, or sizes that cannot work; it names the key.
     """
-    for key, least in LEAST.items():
+    for key in LEAST.keys() | MOST.keys():
         section, _, name = key.rpartition(".")
         value = getattr(getattr(spec, section) if section else spec, name)
-        if value < least:
-            raise ValueError(f"model.{key}: {value} is too small; at least {least}")
+        if value < LEAST.get(key, value):
+            raise ValueError(f"model.{key}: {value} is too small; at least {LEAST[key]}")
+        if value > MOST.get(key, value):
+            raise ValueError(f"model.{key}: {value} is too large; at most {MOST[key]}")
     if spec.hash.min_resolution > spec.hash.max_resolution:
         raise ValueError(
             f"model.hash.min_resolution: {spec.hash.min_resolution} exceeds max_resolution {spec.hash.max_resolution}"

@@ -148,7 +148,8 @@ class SceneModel(nn.Module):
         assert self.decoder is not None
         terms = {}
         if weights.appearance > 0:
-            other = self.encode(others).detach()
+            with torch.no_grad():
+                other = self.encode(others)
             re_encoded = self.encode(as_images(self.colours(features, other)))
             terms["appearance"] = weights.appearance * appearance_consistency(other, re_encoded)
         if weights.content > 0:

@@ -33,8 +33,8 @@ class TrainingPhotos:
         self.c2w = torch.tensor([r.c2w for r in records], device=device)
         self.bounds = torch.tensor([(r.near, r.far) for r in records], device=device)
 
-    def batch(self, patches: list[Patch], size: int) -> Batch:
-        """The pixels of `patches`, each a size x size grid."""
+    def batch(self, patches: list[Patch], size: int, others: bool = True) -> Batch:
+        """The pixels of `patches`, each a size x size grid; the photos of the appearance loss only with `others`."""
         grids = [
             patch_grid(size, p.scale, p.offset_h, p.offset_w, *(int(n) for n in self.sizes[p.photo])) for p in patches
         ]
@@ -55,8 +55,8 @@ class TrainingPhotos:
         near, far = self.bounds[chosen][:, None].expand(-1, rows.shape[1], -1).unbind(-1)
         rays = Rays(origins.flatten(0, 1), directions.flatten(0, 1), near.flatten(), far.flatten())
         references = [self.reference(p.photo) for p in patches]
-        others = [self.reference(p.other) for p in patches]
-        return Batch(rays, colours.to(self.device), positions.to(self.device), references, others)
+        lent = [self.reference(p.other) for p in patches] if others else []
+        return Batch(rays, colours.to(self.device), positions.to(self.device), references, lent)
 
     def pixels(self, photo: int, rows: Tensor, cols: Tensor) -> Tensor:
         """Colours (N, 3) in [0, 1] at rows and columns of one training photo."""

@@ -33,7 +33,9 @@ def main() -> None:
     set_up_logging()
     try:
         app()
-    except CrossrayError as error:
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (CrossrayError, OSError) as error:
         Console(stderr=True).print(
             f"[bold red]crossray:[/] {escape(str(error))}", highlight=False, soft_wrap=True, markup=True
         )
@@ -75,10 +77,24 @@ def landmark(
     """Make the built-in scene: photos "in the wild" of a rendered landmark, with the truth beside them."""
     from pipeline.landmark import write_landmark
     from pipeline.launch.tasks import ray_tasks
+    from pipeline.progress import shown
 
     with ray_tasks() as mapper:
-        write_landmark(out, train=train, val=val, test=test, size=size, seed=seed, sun_jitter=sun_jitter, mapper=mapper)
-    print_line(f"{out}: {train + val + test} photos; crossray run jobs/train_scene_cpu.yaml --set scene.path={out}")
+        write_landmark(
+            out,
+            train=train,
+            val=val,
+            test=test,
+            size=size,
+            seed=seed,
+            sun_jitter=sun_jitter,
+            mapper=shown(mapper, "taking photos"),
+        )
+    print_line(f"{out}: {train + val + test} photos. Its pictures are small, so train on them as they are:")
+    print_line(
+        f"crossray run jobs/train_scene_cpu.yaml --set scene.path={out} --set name=landmark --set scene.downscale=1 "
+        "--set scene.reference_downscale=1 --set 'evaluate.protocols=[crnerf-full@R1]'"
+    )
 
 
 @app.command()
@@ -109,14 +125,19 @@ def shard(
     out: Annotated[Path, typer.Option(help="Folder for the shards.")],
     downscale: Annotated[int, typer.Option(min=1, help="Photos are reduced by this factor.")] = 2,
     reference_downscale: Annotated[int, typer.Option(min=1, help="The encoder's references, by this factor.")] = 8,
-    list_patches: Annotated[int | None, typer.Option(metavar="EPOCH", help="Print an epoch's patch plan.")] = None,
+    list_patches: Annotated[
+        int | None, typer.Option(metavar="EPOCH", min=0, help="Print an epoch's patch plan.")
+    ] = None,
     ranks: Annotated[int, typer.Option(min=1, help="Ranks of the printed plan.")] = 1,
     settings: Settings = [],  # noqa: B006
 ) -> None:
     """Cut a scene into webdataset tars, as Ray tasks. Keys to set: size, photos, min_scale, max_scale, seed."""
-    from pipeline.config import merge, parse_setting
+    from pydantic import ValidationError
+
+    from pipeline.config import explain, merge, parse_setting
     from pipeline.launch.tasks import ray_tasks
     from pipeline.patches import PatchPlan
+    from pipeline.progress import shown
     from pipeline.shards import cut_shards
 
     chosen: dict = {}
@@ -124,11 +145,16 @@ def shard(
         chosen = merge(chosen, parse_setting(setting))
     try:
         plan = PatchPlan(**chosen)
-    except ValueError as error:
-        raise CrossrayError(f"--set: {error}") from None
+    except ValidationError as error:
+        raise CrossrayError("\n".join(f"--set {explain(e)}" for e in error.errors())) from None
     with ray_tasks() as mapper:
         manifest = cut_shards(
-            scene, out, downscale=downscale, reference_downscale=reference_downscale, plan=plan, mapper=mapper
+            scene,
+            out,
+            downscale=downscale,
+            reference_downscale=reference_downscale,
+            plan=plan,
+            mapper=shown(mapper, "cutting shards"),
         )
     if list_patches is None:
         size = sum(s.bytes for s in manifest.shards) / 1e6

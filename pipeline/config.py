@@ -128,7 +128,7 @@ class Job(Section):
     """`local`: starts the ranks on this machine. `torchrun`: torchrun has started them."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """`auto`: CUDA where there is a GPU."""
-    threads: int = Field(1, ge=1)
+    threads: int = Field(1, ge=1, le=1024)
     """Torch threads a rank on CPU, whatever the launcher exports."""
     model: ModelSpec = ModelSpec()
     """What the model is made of."""
@@ -270,6 +270,8 @@ def as_dict(value: Any) -> dict[str, Any]:
 def explain(error: Any) -> str:
     """One pydantic error as `key: what is wrong, nearest right name`."""
     location = [str(part) for part in error["loc"]]
+    if not location:
+        return error["msg"].removeprefix("Value error, ")
     if location[-1] in ("int", "literal['auto']") and error["type"] not in UNKNOWN:  # branches of a union, not keys
         location.pop()
     key = ".".join(location)

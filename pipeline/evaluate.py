@@ -24,7 +24,15 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
 from model.scene_model import SceneModel
-from pipeline.checkpoint import Checkpoint, CheckpointError, latest_checkpoint, read_checkpoint
+from pipeline.checkpoint import (
+    MODEL,
+    Checkpoint,
+    CheckpointError,
+    committed,
+    folder_name,
+    latest_checkpoint,
+    read_checkpoint,
+)
 from pipeline.config import Job, load_job
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write
@@ -84,13 +92,21 @@ def load_run(
     """
     if not (run / "job.yaml").is_file():
         raise CrossrayError(f"{run} is not a run: it has no job.yaml")
-    job = load_job(run / "job.yaml").model_copy(update={"runs": run.resolve().parent, "name": run.resolve().name})
+    job = load_job(run / "job.yaml")
+    folder = run.resolve()
+    scene = job.scene.model_copy(update={"shards": job.shards})  # which stay where they were if the run is moved
+    job = job.model_copy(update={"runs": folder.parent, "name": folder.name, "scene": scene})
     if step is None:
         checkpoint = latest_checkpoint(run / "checkpoints")
         if checkpoint is None:
             raise CheckpointError(f"{run / 'checkpoints'}: no committed checkpoint; has the run been trained?")
     else:
-        checkpoint = read_checkpoint(run / "checkpoints" / f"step-{step:08d}")
+        steps = [int(p.name.removeprefix("step-")) for p in committed(run / "checkpoints")]
+        if step not in steps:
+            raise CheckpointError(
+                f"{run}: no checkpoint of step {step}; there are {', '.join(map(str, steps)) or 'none'}"
+            )
+        checkpoint = read_checkpoint(run / "checkpoints" / folder_name(step))
     device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
     model = SceneModel(job.model, torch.zeros(2, 3)).to(device)  # the scene's box is one of its buffers
     model.load_state_dict(checkpoint.model)
@@ -131,7 +147,7 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
         "protocol": protocol_name,
         "definition": protocol.model_dump(mode="json"),
         "step": checkpoint.step,
-        "checkpoint_sha256": checkpoint.meta["sha256"]["model.safetensors"],
+        "checkpoint_sha256": checkpoint.meta["sha256"][MODEL],
         "method": job.method,
         "samples": list(samples_of(model, protocol) or ()) or "as in training",
         "mean": {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k not in ("name", "key")},
@@ -245,5 +261,15 @@ def check_protocols(job: Job) -> None:
 
 
 def run_protocols(job: Job) -> list[dict[str, Any]]:
-    """Every protocol that the job asks for."""
-    return [evaluate_run(job.run, protocol) for protocol in job.evaluate.protocols]
+    """Every protocol that the job asks for; what this checkpoint was scored under before is read, not done again."""
+    newest = load_run(job.run)[2]
+    return [recorded(job.run, name, newest) or evaluate_run(job.run, name) for name in job.evaluate.protocols]
+
+
+def recorded(run: Path, protocol_name: str, checkpoint: Checkpoint) -> dict[str, Any] | None:
+    """An evaluation of just this checkpoint, if it was made before."""
+    path = run / "eval" / protocol_name / checkpoint.folder.name / "metrics.json"
+    if not path.is_file():
+        return None
+    result = json.loads(path.read_text())
+    return result if result["checkpoint_sha256"] == checkpoint.meta["sha256"][MODEL] else None

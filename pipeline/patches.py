@@ -32,8 +32,8 @@ class PatchPlan(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    size: int = Field(32, ge=2, description="k: a patch is a grid of k x k rays")
-    photos: int = Field(1, ge=1, description="patches a rank and step, each of its own photo")
+    size: int = Field(32, ge=2, le=1024, description="k: a patch is a grid of k x k rays")
+    photos: int = Field(1, ge=1, le=4096, description="patches a rank and step, each of its own photo")
     min_scale: float = Field(0.5, gt=0, le=1, description="smallest part of a photo's sides that a grid spans")
     max_scale: float = Field(1.0, gt=0, le=1, description="largest part of a photo's sides that a grid spans")
     seed: int = Field(0, ge=0, lt=2**63, description="of the order of photos and of all draws")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
@@ -56,3 +58,19 @@ class Progress:
         """End the line."""
         if self.bar is not None:
             self.bar.stop()
+
+
+def shown(mapper: Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]], title: str) -> Callable:
+    """`mapper` with a progress line: how many of its tasks are done."""
+
+    def mapped(fn: Callable[[Any], Any], specs: Iterable[Any]) -> Iterator[Any]:
+        tasks = list(specs)
+        progress = Progress(title)
+        try:
+            for done, result in enumerate(mapper(fn, tasks), start=1):
+                progress.update(done / len(tasks), f"{done} of {len(tasks)}")
+                yield result
+        finally:
+            progress.close()
+
+    return mapped

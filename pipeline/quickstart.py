@@ -27,6 +27,7 @@ from pipeline.files import atomic_write
 from pipeline.landmark import Landmark, write_landmark
 from pipeline.metrics import psnr, ssim_11, to_8bit
 from pipeline.photos import Photos, open_photos
+from pipeline.progress import shown
 from pipeline.render import View, colour_view, read_appearance, render_view
 from pipeline.report import Row, write_overview, write_report
 from pipeline.shards import cut_shards
@@ -94,8 +95,15 @@ def run_quickstart(
     ranks = max(1, torch.multiprocessing.cpu_count())
     ours, nerf = (quickstart_job(out, method, ranks, seconds) for method in ("crossray", "nerf"))
     with tasks() as mapper:
-        write_landmark(out / "scene", **photos, size=size, mapper=mapper)
-        cut_shards(out / "scene", ours.shards, downscale=1, reference_downscale=1, plan=ours.patch, mapper=mapper)
+        write_landmark(out / "scene", **photos, size=size, mapper=shown(mapper, "taking photos"))
+        cut_shards(
+            out / "scene",
+            ours.shards,
+            downscale=1,
+            reference_downscale=1,
+            plan=ours.patch,
+            mapper=shown(mapper, "cutting shards"),
+        )
     trained = {}
     for number, job in enumerate((ours, nerf), start=2):
         console.rule(f"{number}/4  training {job.name}: {ranks} processes, {seconds:.0f} s")

@@ -77,7 +77,7 @@ class Work:
 
     def batch(self, step: int) -> Batch:
         """The pixels, rays and references of these patches."""
-        batch = self.data.batch(self.patches(step), self.job.patch.size)
+        batch = self.data.batch(self.patches(step), self.job.patch.size, others=self.job.losses.appearance > 0)
         strength = self.job.train.colour_jitter
         if strength == 0:
             return batch
@@ -274,7 +274,7 @@ def uses_bfloat16(job: Job, device: torch.device) -> bool:
     if job.train.precision != "auto":
         return job.train.precision == "bfloat16"
     if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     return job.model.field == "mlp" and bool(torch.cpu._is_avx512_bf16_supported())
 
 

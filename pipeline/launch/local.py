@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import uuid
@@ -11,6 +12,7 @@ from typing import Any
 from pipeline.config import Job, save_job
 from pipeline.errors import CrossrayError
 from pipeline.launch.torchrun import StopFlag, pick_device, run_rank_of
+from pipeline.photos import open_photos
 from pipeline.train import Context, train
 
 
@@ -36,6 +38,8 @@ def run_ranks(job: Job) -> dict[str, Any]:
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
+    open_photos(job.shards)  # damaged shards are found once, here, and not by every rank
+    logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)  # what went wrong is raised below
     # A rank waiting for another one must not spin on the core that the other needs.
     for name, value in (("OMP_NUM_THREADS", str(job.threads)), ("OMP_WAIT_POLICY", "PASSIVE")):
         os.environ.setdefault(name, value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from importlib.util import find_spec
 from typing import Any
 
 import yaml
@@ -15,7 +16,9 @@ from pipeline.evaluate import check_protocols, run_protocols
 from pipeline.launch.local import run_local
 from pipeline.launch.tasks import ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
-from pipeline.shards import Manifest, cut_shards, read_manifest
+from pipeline.progress import shown
+from pipeline.scene import read_scene
+from pipeline.shards import Manifest, cut_shards, read_manifest, scene_record
 
 log = logging.getLogger("crossray")
 
@@ -35,8 +38,8 @@ def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     check_protocols(job)
     if job.launcher == "local":
         pick_device(job, job.ranks - 1)  # a job that wants more than there is says so before anything is started
-    claim_run(job)
     ensure_shards(job)
+    claim_run(job)
     if job.launcher == "torchrun":
         trained = run_rank(job)
         if int(os.environ["RANK"]) != 0:
@@ -79,6 +82,19 @@ def flatten(mapping: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def check_scene(job: Job, manifest: Manifest) -> None:
+    """CrossrayError where the shards were cut from another scene than the one that the job names. Shards may travel
+    without their scene: where it is not at hand, or pycolmap is not, they are taken as they are."""
+    if not job.scene.path.is_dir() or find_spec("pycolmap") is None:
+        log.info("%s is not at hand; training on the shards of %s", job.scene.path, manifest.scene.name)
+        return
+    if scene_record(read_scene(job.scene.path)).hash != manifest.scene.hash:
+        raise CrossrayError(
+            f"scene.path: the shards in {job.shards} were cut from another scene, or from {job.scene.path} before it "
+            "changed; --set scene.shards=FOLDER names other ones, or remove that folder"
+        )
+
+
 def ensure_shards(job: Job) -> Manifest:
     """The job's shards, cut by Ray tasks if they are not there; Ray is gone when this returns.
 
@@ -101,9 +117,10 @@ def ensure_shards(job: Job) -> Manifest:
                     downscale=scene.downscale,
                     reference_downscale=scene.reference_downscale,
                     plan=job.patch,
-                    mapper=mapper,
+                    mapper=shown(mapper, f"cutting shards of {scene.path.name}"),
                 )
     manifest = read_manifest(folder)
+    check_scene(job, manifest)
     for key in ("downscale", "reference_downscale"):
         if getattr(manifest, key) != getattr(scene, key):
             raise CrossrayError(

@@ -113,3 +113,5 @@ def _map_tasks(fn: Callable[[Any], Any], specs: Iterable[Any]) -> Iterator[Any]:
     finally:
         for reference in pending:
             ray.cancel(reference)
+        if pending:  # shutting Ray down under a task that is being cancelled can crash this process
+            ray.wait(pending, num_returns=len(pending), timeout=10)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from pipeline.train import Context, train
 
 
 class StopFlag:
-    """Set by SIGTERM or Ctrl-C: the ranks agree on it, write a checkpoint and return. A second Ctrl-C ends at once."""
+    """Set by SIGTERM or Ctrl-C: the ranks agree on it, write a checkpoint and return. A later Ctrl-C ends at once."""
 
     def __init__(self) -> None:
         self.set = False
+        self.since = 0.0
 
     def install(self) -> StopFlag:
         """Listen from now on."""
@@ -29,9 +31,11 @@ class StopFlag:
         return self
 
     def stop(self, number: int, frame: object) -> None:
-        """The handler."""
-        self.set = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        """The handler. One Ctrl-C arrives twice where a launcher hands it to ranks that had it from the terminal."""
+        if self.set and number == signal.SIGINT and time.monotonic() - self.since > 2:
+            raise KeyboardInterrupt
+        if not self.set:
+            self.set, self.since = True, time.monotonic()
 
     def __call__(self) -> bool:
         return self.set

@@ -140,7 +140,7 @@ def test_an_older_step_may_be_asked_for(run):
     result = evaluate_run(folder, "crnerf-full@R2", step=3)
     assert result["step"] == 3
     assert (folder / "eval" / "crnerf-full@R2" / "step-00000003" / "metrics.json").is_file()
-    with pytest.raises(CheckpointError, match="step-00000004"):
+    with pytest.raises(CheckpointError, match="no checkpoint of step 4; there are 3, 6"):
         evaluate_run(folder, "crnerf-full@R2", step=4)
 
 

@@ -85,14 +85,17 @@ def wait(process: subprocess.Popen, folder: Path) -> tuple[int, str]:
     return status, (folder / "output").read_text()
 
 
-def interrupt_once_there(process: subprocess.Popen, path: Path) -> None:
-    """SIGTERM to the process as soon as `path` exists."""
+def interrupt_once_there(process: subprocess.Popen, path: Path, ctrl_c: bool = False) -> None:
+    """SIGTERM to the process as soon as `path` exists; or SIGINT to it and all its ranks, as a terminal's Ctrl-C."""
     deadline = time.monotonic() + PATIENCE
     while not path.exists():
         assert process.poll() is None, "the process ended before it could be interrupted"
         assert time.monotonic() < deadline, f"{path} never came"
         time.sleep(0.02)
-    process.send_signal(signal.SIGTERM)
+    if ctrl_c:
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        process.send_signal(signal.SIGTERM)
 
 
 def assert_stopped_on_the_way(job: Job) -> int:
@@ -135,10 +138,11 @@ def test_sigterm_to_torchrun_leaves_a_checkpoint_and_resumes_to_the_same_bits(cu
 
 
 @pytest.mark.slow
-def test_sigterm_to_the_local_launcher_ends_cleanly(cut, tmp_path):
-    job = two_ranks(cut, "local")
+@pytest.mark.parametrize("ctrl_c", [False, True], ids=["SIGTERM", "Ctrl-C"])
+def test_the_local_launcher_ends_cleanly(cut, tmp_path, ctrl_c):
+    job = two_ranks(cut, f"local-{ctrl_c}")
     process = start(job, tmp_path, "pipeline")
-    interrupt_once_there(process, checkpoints(job) / FIRST)
+    interrupt_once_there(process, checkpoints(job) / FIRST, ctrl_c)
     _, output = wait(process, tmp_path)
     assert_stopped_on_the_way(job)
     assert "forcefully" not in output, output  # the ranks ended by themselves

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline import progress as module
-from pipeline.progress import Progress
+from pipeline.progress import Progress, shown
 
 
 @pytest.fixture
@@ -56,3 +56,9 @@ def test_other_ranks_say_nothing(clock, lines):
     progress.update(0.5)
     progress.close()
     assert lines == []
+
+
+def test_a_shown_mapper_gives_what_the_mapper_gives_and_hides_no_error():
+    assert list(shown(map, "work")(abs, iter([-1, 2, -3]))) == [1, 2, 3]
+    with pytest.raises(TypeError):
+        list(shown(map, "work")(abs, [1, "no number"]))

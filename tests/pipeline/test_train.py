@@ -434,6 +434,25 @@ def test_shards_of_another_size_are_refused(make):
         ensure_shards(job)
 
 
+def test_shards_of_another_scene_are_refused(make, tmp_path):
+    write_tiny_scene(tmp_path / "other", photos=5)
+    job = make("nerf", over={"scene": {"path": str(tmp_path / "other")}})
+    with pytest.raises(CrossrayError, match=r"cut from another scene.*scene\.shards"):
+        ensure_shards(job)
+
+
+def test_shards_train_without_their_scene(make, tmp_path):
+    manifest = ensure_shards(make("nerf", over={"scene": {"path": str(tmp_path / "not here")}}))
+    assert len(manifest.keys) == 6
+
+
+def test_a_first_try_with_a_wrong_scene_does_not_claim_the_name(make, tmp_path):
+    wrong = make("nerf", over={"scene": {"path": str(tmp_path / "no"), "shards": str(tmp_path / "none")}})
+    with pytest.raises(CrossrayError, match=r"scene\.path"):
+        run_job(wrong)
+    assert run_job(make("nerf"))[0]["finished"]
+
+
 def test_missing_shards_are_cut(make, monkeypatch, tmp_path):
     monkeypatch.setattr(launch, "ray_tasks", lambda: nullcontext(in_process))
     job = make("nerf", over={"scene": {"shards": str(tmp_path / "new" / "shards")}})
@@ -447,7 +466,10 @@ def test_a_whole_job_trains_and_evaluates(make, monkeypatch):
     trained, scores = run_job(job)
     assert trained["finished"]
     assert [s["protocol"] for s in scores] == ["crnerf-full@R2"]
-    assert (job.run / "eval" / "crnerf-full@R2" / "step-00000012" / "metrics.json").is_file()
+    metrics = job.run / "eval" / "crnerf-full@R2" / "step-00000012" / "metrics.json"
+    written = metrics.stat().st_mtime_ns
+    assert run_job(job)[1] == scores  # again: nothing is trained or scored twice
+    assert metrics.stat().st_mtime_ns == written
 
 
 @pytest.mark.parametrize("protocol", ["crnerf-ful@R2", "crnerf-full", "crnerf-full@R4"])
