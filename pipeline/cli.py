@@ -4,7 +4,6 @@ or pycolmap can train from shards."""
 from __future__ import annotations
 
 import json
-import logging
 import os
 import sys
 from pathlib import Path
@@ -12,11 +11,11 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.logging import RichHandler
 from rich.markup import escape
 from rich.table import Table
 
 from pipeline.errors import CrossrayError
+from pipeline.log import set_up_logging
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -40,16 +39,6 @@ def main() -> None:
             f"[bold red]crossray:[/] {escape(str(error))}", highlight=False, soft_wrap=True, markup=True
         )
         sys.exit(2)
-
-
-def set_up_logging() -> None:
-    """The project's log to the terminal; only rank 0 says what is not a warning."""
-    quiet = os.environ.get("RANK", "0") != "0"
-    handler = RichHandler(show_path=False, show_level=False, log_time_format="[%X]", console=Console(stderr=True))
-    logger = logging.getLogger("crossray")
-    logger.handlers[:] = [handler]
-    logger.setLevel(logging.WARNING if quiet else logging.INFO)
-    logger.propagate = False
 
 
 @app.command()

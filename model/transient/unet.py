@@ -12,7 +12,7 @@ INITIAL_LOGIT = -2.0  # nearly nothing is transient before anything is learned
 class UNet(nn.Module):
     """Three scales, the finest at half the input: pixels enter and leave in 2 x 2 groups.
 
-    On a CPU the same network at full resolution was four times slower. GroupNorm keeps no statistics across photos, so
+    That costs a CPU far less than the same network at full resolution. GroupNorm keeps no statistics across photos, so
     training and evaluation see the same function.
 
     Args:

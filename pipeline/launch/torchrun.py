@@ -14,6 +14,7 @@ import torch.distributed as dist
 
 from pipeline.config import Job, load_job
 from pipeline.errors import CrossrayError
+from pipeline.log import set_up_logging
 from pipeline.train import Context, train
 
 
@@ -90,8 +91,6 @@ def run_rank(job: Job) -> dict[str, Any]:
 
 def run_rank_of(job_file: str) -> dict[str, Any]:
     """Entry point of a rank that this machine's own launcher starts."""
-    from pipeline.cli import set_up_logging
-
     set_up_logging()
     result = run_rank(load_job(Path(job_file)))
     if not result["finished"]:
