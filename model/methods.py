@@ -1,7 +1,8 @@
 """METHODS: every system of the paper as a point in one design space.
 
-A method is four choices: the field, where colour comes from, how appearance enters, and how transients are handled.
-Nothing in the code asks for a method's name: parts are built from the choices alone, so a new method is a new row.
+A method is five choices: the field, where colour comes from, how appearance enters and where it is fused, and how
+transients are handled. Nothing in the code asks for a method's name: parts are built from the choices alone, so a new
+method is a new row.
 
 The paper's text says that CR-NeRF-A and -T *remove* a module; its captions, its mask table and its numbers say that
 they *add* one to -B. The rows below follow the numbers.
@@ -11,6 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
+
+CODE = 48  # numbers in a photo's appearance code (NeRF-W's l_a; Ha-NeRF's)
+TRANSIENT_CODE = 16  # numbers in a photo's transient code (NeRF-W's l_tau)
+VIEW_CODE = 128  # numbers in a photo's code for its uv mask (Ha-NeRF)
 
 STRICT = {
     "extra": "forbid",
@@ -73,14 +78,22 @@ class ModelSpec:
     """`mlp`: the NeRF networks of the paper. `hash`: the fast field."""
     colour: Literal["head", "decoder"] = "decoder"
     """`head`: RGB at each point, then volume rendering. `decoder`: features are rendered, then decoded."""
-    appearance: Literal["none", "crossray"] = "crossray"
-    """`crossray`: appearance encoder and transform over all rays of a view. `none`: one appearance for all photos."""
-    transient: Literal["none", "segmenter"] = "segmenter"
-    """`segmenter`: a network predicts each photo's transient mask. `none`: every pixel counts."""
+    appearance: Literal["none", "embedding", "code", "crossray"] = "crossray"
+    """`embedding`: a learned code for each training photo (NeRF-W). `code`: a CNN reads it from a photo (Ha-NeRF).
+    `crossray`: an encoder and a transform over all rays of a view (CR-NeRF). `none`: one appearance for all photos."""
+    fused: Literal["none", "point", "ray"] = "ray"
+    """Where appearance meets the place: at points, before volume rendering, or at rays, after it."""
+    transient: Literal["none", "segmenter", "uncertainty", "uvmask", "fixed"] = "segmenter"
+    """`segmenter`: a network masks each photo (CR-NeRF). `uncertainty`: a second, transient field and a variance for
+    each ray (NeRF-W). `uvmask`: a mask for each photo as an MLP over its pixels (Ha-NeRF). `fixed`: masks read from the
+    data (`crossray mask`). `none`: every pixel counts."""
     channels: int = 64
     """Channels of a feature (with colour `decoder`)."""
     encoder: Literal["released", "compact"] = "released"
-    """Appearance encoder and transform: the released code's, or small ones for small pictures."""
+    """Networks that read a photo's appearance: the released code's, or small ones for small pictures."""
+    transform: Literal["learned", "mean_only", "closed_form"] = "learned"
+    """How `crossray` makes one appearance into another: `learned` as released; `mean_only` without second moments, the
+    control for them; `closed_form` by Proposition 1, with nothing learned."""
     segmenter: Literal["cgnet", "unet"] = "cgnet"
     """Segmenter network: the released code's, or a small U-Net whose masks are as fine as its input."""
     pixel_center: float = 0.0
@@ -91,29 +104,58 @@ class ModelSpec:
     """Sizes of the field `hash`."""
 
 
+AXES = ("field", "colour", "appearance", "fused", "transient")
+FUSED_AT = {"none": "none", "embedding": "point", "code": "point", "crossray": "ray"}  # where nothing else is said
+
+
 @dataclass(frozen=True)
 class Method:
-    """One row: the choices, and what the row reproduces."""
+    """One row: the choices, what the row reproduces, and what of it is unpublished, so that we had to choose."""
 
     field: str
     colour: str
     appearance: str
+    fused: str
     transient: str
     reproduces: str
+    our_choice: str = ""
 
     def axes(self) -> dict[str, str]:
-        """The four choices, by the names that ModelSpec gives them."""
-        return {k: getattr(self, k) for k in ("field", "colour", "appearance", "transient")}
+        """The five choices, by the names that ModelSpec gives them."""
+        return {axis: getattr(self, axis) for axis in AXES}
 
+
+FAST = "the field, its recipe, and the small appearance networks and segmenter (model/appearance/compact.py)"
+POINTS = (
+    "statistics over all points of all rays, each counting alike; T at each point; D after volume rendering, so that "
+    "only the place of fusion and its statistics differ from crnerf"
+)
+UNCERTAIN = (
+    "the transient field gives features like the static one, composited with them before T and D; statistics come "
+    "from the static features alone, which are all that there is at test"
+)
 
 METHODS: dict[str, Method] = {
-    "nerf": Method("mlp", "head", "none", "none", "NeRF, the paper's table 1"),
-    "crnerf-b": Method("mlp", "decoder", "none", "none", "CR-NeRF-B, ablation"),
-    "crnerf-a": Method("mlp", "decoder", "crossray", "none", "CR-NeRF-A, ablation: B + appearance"),
-    "crnerf-t": Method("mlp", "decoder", "none", "segmenter", "CR-NeRF-T, ablation: B + transient"),
-    "crnerf": Method("mlp", "decoder", "crossray", "segmenter", "CR-NeRF, the paper's table 1"),
-    "crossray": Method("hash", "decoder", "crossray", "segmenter", "ours: CR-NeRF on the fast field"),
-}
+    "nerf": Method("mlp", "head", "none", "none", "none", "NeRF: table 1"),
+    "nerfw": Method(
+        "mlp", "head", "embedding", "point", "uncertainty", "NeRF-W: table 1, as the re-implementation that it cites",
+        "at test the code is fitted to the photo's left half; the paper does not say how its rows were made",
+    ),
+    "hanerf": Method("mlp", "head", "code", "point", "uvmask", "Ha-NeRF: table 1"),
+    "crnerf-b": Method("mlp", "decoder", "none", "none", "none", "CR-NeRF-B: ablation"),
+    "crnerf-a": Method("mlp", "decoder", "crossray", "ray", "none", "CR-NeRF-A: ablation, B + appearance"),
+    "crnerf-t": Method("mlp", "decoder", "none", "none", "segmenter", "CR-NeRF-T: ablation, B + transient"),
+    "crnerf-u": Method(
+        "mlp", "decoder", "crossray", "ray", "uncertainty", "CR-NeRF-U: uncertainty table", UNCERTAIN
+    ),
+    "crnerf-a-masks": Method(
+        "mlp", "decoder", "crossray", "ray", "fixed", "CR-NeRF-A + DeepLabV3 or Mask R-CNN: mask table",
+        "which classes count as transient (pipeline/masks.py)",
+    ),
+    "crnerf-r": Method("mlp", "decoder", "crossray", "point", "segmenter", "CR-NeRF-R: table 1", POINTS),
+    "crnerf": Method("mlp", "decoder", "crossray", "ray", "segmenter", "CR-NeRF: table 1"),
+    "crossray": Method("hash", "decoder", "crossray", "ray", "segmenter", "ours: CR-NeRF on the fast field", FAST),
+}  # fmt: skip
 
 
 LEAST = {  # sizes below these have no meaning
@@ -153,13 +195,37 @@ def check_spec(spec: ModelSpec) -> None:
         raise ValueError(
             f"model.hash.min_resolution: {spec.hash.min_resolution} exceeds max_resolution {spec.hash.max_resolution}"
         )
-    if spec.appearance == "crossray" and spec.colour == "head":
-        raise ValueError(
-            "model.appearance: crossray needs model.colour: decoder, because it transforms rendered features "
-            "before they are decoded; with colour: head the field already gives RGB"
-        )
+    check_fusion(spec)
     if spec.encoder == "released" and spec.appearance == "crossray" and spec.channels != 64:
         raise ValueError(
             f"model.channels: the released encoder gives 64 channels, not {spec.channels}; "
             "set model.channels to 64 or model.encoder to compact"
+        )
+
+
+def check_fusion(spec: ModelSpec) -> None:
+    """ValueError where appearance cannot enter in the way that is asked for."""
+    if spec.appearance == "crossray" and spec.colour == "head":
+        raise ValueError(
+            "model.appearance: crossray needs model.colour: decoder, because it transforms features "
+            "before they are decoded; with colour: head the field already gives RGB"
+        )
+    if spec.appearance == "none" and spec.fused != "none":
+        raise ValueError(
+            f"model.fused: {spec.fused}, but with model.appearance: none there is nothing to fuse; none fits"
+        )
+    if spec.appearance != "none" and spec.fused == "none":
+        raise ValueError(
+            f"model.fused: none, but model.appearance: {spec.appearance} has to be fused somewhere; "
+            f"{FUSED_AT[spec.appearance]} fits"
+        )
+    if spec.appearance in ("embedding", "code") and spec.fused == "ray":
+        raise ValueError(
+            f"model.fused: ray needs model.appearance: crossray, because a code ({spec.appearance}) is an input of the "
+            "network that gives each point its colour; point fits"
+        )
+    if spec.appearance != "crossray" and spec.transform != "learned":
+        raise ValueError(
+            f"model.transform: {spec.transform} needs model.appearance: crossray; with {spec.appearance} there is "
+            "nothing to transform"
         )

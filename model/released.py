@@ -1,4 +1,4 @@
-"""Names of parameters, the released code's -> ours: one map a module, for checkpoints and golden vectors.
+"""Names of parameters, those of released codes -> ours: one map a module, for checkpoints and golden vectors.
 
 A map covers every parameter and buffer of its module, so a released state dict is either read whole or
 refused.
@@ -108,13 +108,94 @@ CGNET = _joined(
     _kernel("classifier.0", "classifier"),
 )
 
+# Ha-NeRF: enc_a -> ReleasedCode. Its fine network is a NERF_MLP.
+CODE_NETWORK = _joined(
+    *(_layer(f"model.{3 * i + 1}", f"layers.{2 * i}") for i in range(5)),
+    _layer("model.16", "head"),
+)
+
+# Ha-NeRF: implicit_mask -> UVMask.layers; the table of photos belongs to a scene, not to the network.
+UV_MASK = _joined(*(_layer(f"mask_mapping.{i}", str(i)) for i in (0, 2, 4, 6, 8)))
+
+# NeRF-W in nerf_pl: what its fine network has beside a NERF_MLP -> TransientHead
+TRANSIENT_HEAD = _joined(
+    *(_layer(f"transient_encoding.{i}", f"layers.{i}") for i in (0, 2, 4, 6)),
+    _layer("transient_sigma.0", "density"),
+    _layer("transient_rgb.0", "features"),
+    _layer("transient_beta.0", "beta"),
+)
+
+# A whole CR-NeRF checkpoint: what the names of each network begin with, and the map for the rest of the name
+CRNERF = {
+    "nerf_coarse.": NERF_MLP,
+    "nerf_fine.": NERF_MLP,
+    "enc_a.": ENCODER,
+    "enc_cont.": ENCODER,
+    "decoder.multi_net.": TRANSFORM,
+    "decoder.decoder.": DECODER,
+    "implicit_mask.": CGNET,
+}
+TRAINING_ONLY = ("enc_cont.", "implicit_mask.")  # E5 and S: no picture needs them
+
 # In released state dicts, but never used: the blur of the decoder's upsampling, of which there are 0 steps.
-IGNORED = frozenset({"rgb_upsample.1.f"})
+IGNORED = frozenset({"rgb_upsample.1.f", "decoder.decoder.rgb_upsample.1.f"})
+
+_WITHIN_DECODER = dict.fromkeys(TRANSFORM, "decoder.multi_net.") | dict.fromkeys(
+    (*DECODER, "rgb_upsample.1.f"), "decoder.decoder."
+)
 
 
 def under(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """The entries whose name starts with `prefix`, without it."""
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+def split_crnerf(state: Mapping[str, Tensor]) -> tuple[dict[str, dict[str, Tensor]], list[str]]:
+    """The state dict of a CR-NeRF checkpoint by network: {prefix in CRNERF: its entries}, and the names of no network.
+
+    Names stay whole, as messages need them. A `module.` in front of every name (DataParallel) is dropped, and names
+    of T and D that stand directly below `decoder.` are put where they belong. A network without entries is left out.
+    """
+    wrapped = all(name.startswith("module.") for name in state)
+    state = under(state, "module.") if wrapped else state
+    parts: dict[str, dict[str, Tensor]] = {}
+    strangers = []
+    for name, value in state.items():
+        name = _in_its_place(name, state)
+        prefix = next((prefix for prefix in CRNERF if name.startswith(prefix)), None)
+        if prefix is None:
+            strangers.append(name)
+        else:
+            parts.setdefault(prefix, {})[name] = value
+    return parts, strangers
+
+
+def load_crnerf(modules: Mapping[str, nn.Module], state: Mapping[str, Tensor]) -> list[str]:
+    """Copy the state dict of a CR-NeRF checkpoint into `modules` {prefix in CRNERF: network}.
+
+    Returns the prefixes of TRAINING_ONLY that `state` lacks: those networks are left as they were. Networks of
+    `state` that are not in `modules` are passed over. ValueError, with every offending name of all networks, if
+    anything else is missing, unknown or of another shape; networks that are whole are then loaded all the same.
+    """
+    parts, strangers = split_crnerf(state)
+    absent = [prefix for prefix in modules if prefix not in parts and prefix in TRAINING_ONLY]
+    problems = _listed("unknown", strangers)
+    for prefix, module in modules.items():
+        if prefix in absent:
+            continue
+        try:
+            load_released(module, parts.get(prefix, {}), {prefix + name: ours for name, ours in CRNERF[prefix].items()})
+        except ValueError as error:
+            problems.append(str(error))
+    if problems:
+        raise ValueError("this is no released CR-NeRF: " + "; ".join(problems))
+    return absent
+
+
+def _in_its_place(name: str, state: Mapping[str, Tensor]) -> str:
+    rest = name.removeprefix("decoder.")
+    whole = _WITHIN_DECODER.get(rest, "decoder.") + rest
+    return name if name == rest or whole in state else whole
 
 
 def load_released(module: nn.Module, state: Mapping[str, Tensor], names: Mapping[str, str]) -> None:

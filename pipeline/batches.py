@@ -9,6 +9,7 @@ from torch import Tensor
 from model.cameras import patch_grid, pixel_rays
 from model.fields.base import Rays
 from model.scene_model import Batch
+from pipeline.errors import CrossrayError
 from pipeline.patches import Patch
 from pipeline.photos import Photos
 
@@ -20,13 +21,20 @@ class TrainingPhotos:
         photos: all photos of the scene.
         device: where rays and colours go.
         pixel_center: where in its pixel a ray goes through.
+        masks: batches carry the masks that the shards hold.
+
+    Raises:
+        CrossrayError: masks are wanted, and a training photo has none.
     """
 
-    def __init__(self, photos: Photos, device: torch.device, pixel_center: float) -> None:
+    def __init__(self, photos: Photos, device: torch.device, pixel_center: float, masks: bool = False) -> None:
         self.photos = photos
         self.device = device
         self.pixel_center = pixel_center
+        self.masks = masks
         self.index = photos.indices("train")
+        if masks:
+            check_masks(photos, self.index)
         records = [photos.records[i] for i in self.index]
         self.sizes = np.array([(r.height, r.width) for r in records], dtype=np.int64)
         self.intrinsics = torch.tensor([(r.fx, r.fy, r.cx, r.cy) for r in records], device=device)
@@ -40,7 +48,9 @@ class TrainingPhotos:
         ]
         rows = torch.stack([g[0] for g in grids])
         cols = torch.stack([g[1] for g in grids])
-        colours = torch.stack([self.pixels(p.photo, r, c) for p, r, c in zip(patches, rows, cols, strict=True)])
+        places = list(zip(patches, rows, cols, strict=True))
+        colours = torch.stack([self.pixels(p.photo, r, c) for p, r, c in places])
+        masks = torch.stack([self.mask(p.photo, r, c) for p, r, c in places]).to(self.device) if self.masks else None
         height, width = torch.from_numpy(self.sizes[[p.photo for p in patches]]).float().t()
         positions = torch.stack([(cols + 0.5) / width[:, None], (rows + 0.5) / height[:, None]], dim=-1)
 
@@ -56,16 +66,34 @@ class TrainingPhotos:
         rays = Rays(origins.flatten(0, 1), directions.flatten(0, 1), near.flatten(), far.flatten())
         references = [self.reference(p.photo) for p in patches]
         lent = [self.reference(p.other) for p in patches] if others else []
-        return Batch(rays, colours.to(self.device), positions.to(self.device), references, lent)
+        photos = torch.tensor(chosen, device=self.device)
+        return Batch(rays, colours.to(self.device), positions.to(self.device), photos, references, lent, masks)
 
     def pixels(self, photo: int, rows: Tensor, cols: Tensor) -> Tensor:
         """Colours (N, 3) in [0, 1] at rows and columns of one training photo."""
         image = self.photos.image(self.index[photo])
         return torch.from_numpy(image[rows.numpy(), cols.numpy()]).float() / 255
 
+    def mask(self, photo: int, rows: Tensor, cols: Tensor) -> Tensor:
+        """Transient probabilities (N,) of the data at rows and columns of one training photo."""
+        mask = self.photos.mask(self.index[photo])
+        assert mask is not None
+        return torch.from_numpy(mask[rows.numpy(), cols.numpy()]).float() / 255
+
     def reference(self, photo: int) -> Tensor:
         """The appearance reference (3, h, w) in [0, 1] of one training photo."""
         return as_tensor(self.photos.reference(self.index[photo]), self.device)
+
+
+def check_masks(photos: Photos, indices: tuple[int, ...]) -> None:
+    """CrossrayError unless all of these photos have masks."""
+    without = [photos.records[i].name for i in indices if photos.mask(i) is None]
+    if without:
+        more = f" and {len(without) - 1} more training photos" if len(without) > 1 else ""
+        raise CrossrayError(
+            f"model.transient: fixed, but the shards hold no mask of {without[0]}{more}; "
+            "`crossray mask SCENE --with ...` makes masks, and the shards are then cut again"
+        )
 
 
 def as_tensor(image: np.ndarray, device: torch.device) -> Tensor:

@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from model.scene_model import SceneModel
-from pipeline.batches import as_tensor
 from pipeline.photos import Photos
-from pipeline.render import colour_view, read_appearance, render_view
+from pipeline.render import colour_view, predicted_mask, render_view, training_appearance
 
 PICTURE_SIDE = 160  # pictures are rendered at about this many pixels a side
 
@@ -47,21 +46,23 @@ def write_scalars(
 
 
 def write_pictures(writer: SummaryWriter, step: int, model: SceneModel, photos: Photos) -> None:
-    """A fixed validation view (a training view where there is no other) with its PSNR, depth, and mask."""
-    index = (photos.indices("val") or photos.indices("train"))[0]
+    """A fixed validation view with its PSNR, depth, and mask; a training view where there is no other, or where the
+    model knows the appearance of training photos alone."""
+    seen = () if model.embedding is not None else photos.indices("val")
+    index = (seen or photos.indices("train"))[0]
     camera = photos.records[index]
     stride = max(1, round(max(camera.width, camera.height) / PICTURE_SIDE))
     model.eval()
-    view = render_view(model, camera, stride=stride)
-    picture = colour_view(model, view, read_appearance(model, photos.reference(index)))
+    appearance = training_appearance(model, photos, index)
+    view = render_view(model, camera, appearance if model.coded else None, stride=stride)
+    picture = colour_view(model, view, appearance)
     photo = photos.image(index)[stride // 2 :: stride, stride // 2 :: stride] / 255
     writer.add_image("view/rendered", picture, step, dataformats="HWC")
     writer.add_image("view/photo", photo, step, dataformats="HWC")
     depth = (view.depth / view.depth.max().clamp(min=1e-6)).cpu().numpy()
     writer.add_image("view/depth", depth, step, dataformats="HW")
     writer.add_scalar("view/psnr", psnr_of(float(np.square(picture - photo).mean())), step)
-    if model.segmenter is not None:
-        reference = as_tensor(photos.reference(index), view.depth.device)
-        mask = model.transient_mask(reference, view.size).cpu().numpy()
+    mask = predicted_mask(model, photos, index if model.segmenter is not None else photos.indices("train")[0])
+    if mask is not None:
         writer.add_image("view/mask", mask, step, dataformats="HW")
     model.train()

@@ -167,6 +167,29 @@ def print_patches(folder: Path, plan: object, epoch: int, ranks: int) -> None:
 
 
 @app.command()
+def mask(
+    scene: Annotated[Path, typer.Argument(help="Folder of a posed scene.")],
+    segmenter: Annotated[
+        str, typer.Option("--with", help="deeplabv3, maskrcnn, tflite:FILE, or folder:DIR with masks made elsewhere.")
+    ],
+    replace: Annotated[bool, typer.Option("--replace", help="Masks that are there may be overwritten.")] = False,
+) -> None:
+    """Mask what is transient in a scene's photos with a network made elsewhere. Again: goes on from where it was."""
+    from pipeline.launch.tasks import ray_tasks
+    from pipeline.masks import make_masks
+    from pipeline.progress import shown
+    from pipeline.segmentation import find_segmenter
+
+    found = find_segmenter(segmenter)
+    with ray_tasks() as mapper:
+        masked = make_masks(scene, found, replace=replace, mapper=shown(mapper, "masking photos"))
+    print_line(
+        f"{masked.folder}: {masked.photos} photos, {100 * masked.share:.2f} % masked on average; {masked.made} made now"
+    )
+    print_line(f"crossray run jobs/train_scene.yaml --set scene.path={scene} --set method=crnerf-a-masks")
+
+
+@app.command()
 def verify(folder: Annotated[Path, typer.Argument(help="Folder of shards.")]) -> None:
     """Check every hash and every sample of a folder of shards."""
     from pipeline.shards import verify_shards
@@ -188,15 +211,38 @@ def evaluate(
         print_scores(evaluate_run(run, name, step))
 
 
+@app.command("import-checkpoint")
+def import_released(
+    file: Annotated[Path, typer.Argument(help="A released CR-NeRF checkpoint (.ckpt).")],
+    job: Annotated[Path, typer.Argument(help="The job whose run it becomes; method: crnerf.")],
+    settings: Settings = [],  # noqa: B006
+) -> None:
+    """Turn a released CR-NeRF checkpoint into a run, executing nothing of the file."""
+    from pipeline.config import load_job
+    from pipeline.importing import import_checkpoint
+
+    resolved = load_job(job, settings)
+    folder = import_checkpoint(file, resolved)
+    print_line(f"{folder}: imported. crossray evaluate {folder} --protocol crnerf-full@R{resolved.scene.downscale}")
+
+
 @app.command()
 def methods() -> None:
     """The methods: each is a point in one design space."""
-    from model.methods import METHODS
+    from model.losses import loss_terms
+    from model.methods import AXES, METHODS
+    from pipeline.config import make_job
 
-    table = Table("method", "field", "colour", "appearance", "transient", "reproduces")
+    table = Table("method", *AXES, title="A method is five choices", pad_edge=False)
+    notes = Table(
+        "method", "reproduces", "losses", "unpublished, so our choice", title="\nWhat each is", pad_edge=False
+    )
     for name, method in METHODS.items():
-        table.add_row(name, method.field, method.colour, method.appearance, method.transient, method.reproduces)
-    Console().print(table)
+        job = make_job({"name": name, "method": name, "scene": {"path": "."}})
+        table.add_row(name, *method.axes().values())
+        notes.add_row(name, method.reproduces, " ".join(loss_terms(job.model, job.losses)), method.our_choice or "-")
+    Console().print(table, notes)
+    print_line("Any choice can be set by itself: --set model.transient=uncertainty, --set model.field=hash, ...")
 
 
 @app.command()

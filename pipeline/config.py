@@ -1,7 +1,8 @@
 """The job file: its schema, its defaults, and how a key is set from the command line.
 
-Defaults depend on two things only: the method gives the four choices of the model, and the field (the paper's MLPs or
-the fast hash grid) gives the recipe that trains it. What a job file says wins over both, and `--set` over the file.
+Defaults depend on two things only: the method gives the choices of the model, and these choices (above all the field:
+the paper's MLPs or the fast hash grid) give the recipe that trains it. What a job file says wins over both, and `--set`
+over the file.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from model.losses import LossWeights, check_weights
-from model.methods import METHODS, ModelSpec, check_spec
+from model.losses import PRESETS, LossWeights, check_weights
+from model.methods import FUSED_AT, METHODS, ModelSpec, check_spec
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.patches import PatchPlan
@@ -61,8 +62,10 @@ class LearningRates(Section):
     """Networks of the field, and the decoder."""
     appearance: float = Field(5e-4, gt=0)
     """Appearance encoder, content encoder, transform."""
+    embedding: float = Field(5e-4, gt=0)
+    """What is learned of each photo by itself: appearance codes, transient codes, codes of uv masks."""
     transient: float = Field(5e-4, gt=0)
-    """Segmenter."""
+    """Segmenter, uv mask."""
 
 
 class TrainJob(Section):
@@ -150,7 +153,8 @@ class Job(Section):
     def shards(self) -> Path:
         """The scene's shards at the job's downscale."""
         scene = self.scene
-        return scene.shards or self.runs.parent / "shards" / f"{scene.path.resolve().name}-R{scene.downscale}"
+        masks = "-masks" if self.model.transient == "fixed" else ""  # shards with masks are another set of shards
+        return scene.shards or self.runs.parent / "shards" / f"{scene.path.resolve().name}-R{scene.downscale}{masks}"
 
 
 RECIPES: dict[str, dict[str, Any]] = {
@@ -158,15 +162,15 @@ RECIPES: dict[str, dict[str, Any]] = {
     "hash": {
         "model": {"channels": 32, "encoder": "compact", "segmenter": "unet", "pixel_center": 0.5},
         "patch": {"size": 12, "photos": 4},
-        "losses": {
-            "mask_start": 0.3,
-            "mask_end": 0.01,
-            "mask_decay": 0.007,
-            "appearance": 0.0,
-            "content": 0.0,
-        },
+        "losses": {"preset": "fast"},
         "train": {
-            "learning_rates": {"grid": 0.02, "field": 0.004, "appearance": 0.0012, "transient": 0.001},
+            "learning_rates": {
+                "grid": 0.02,
+                "field": 0.004,
+                "appearance": 0.0012,
+                "embedding": 0.02,
+                "transient": 0.001,
+            },
             "adam_betas": [0.9, 0.99],
             "adam_epsilon": 1e-15,
             "warmup_steps": 50,
@@ -213,12 +217,18 @@ def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "j
 
 
 def check_patch(job: Job) -> None:
-    """Refuse patches that the appearance losses cannot encode: the released encoder halves a picture twice."""
-    encodes = job.model.appearance == "crossray" and job.model.encoder == "released"
-    if encodes and job.patch.size < 8 and (job.losses.appearance > 0 or job.losses.content > 0):
+    """Refuse patches that the appearance losses cannot encode, and colours that nothing could explain."""
+    model, losses = job.model, job.losses
+    least = {"crossray": 8, "code": 16}.get(model.appearance, 0) if model.encoder == "released" else 0
+    if job.patch.size < least and (losses.appearance > 0 or losses.content > 0):
         raise ValueError(
-            f"patch.size: {job.patch.size} is too small for the appearance losses with model.encoder: released, which "
-            "encode a rendered patch; at least 8"
+            f"patch.size: {job.patch.size} is too small for the appearance losses with model.appearance: "
+            f"{model.appearance} and model.encoder: released, which encode a rendered patch; at least {least}"
+        )
+    if job.train.colour_jitter > 0 and model.appearance in ("none", "embedding"):
+        raise ValueError(
+            f"train.colour_jitter: {job.train.colour_jitter} changes a photo's colours in each step, and with "
+            f"model.appearance: {model.appearance} nothing is read from the changed photo; 0 fits"
         )
 
 
@@ -228,15 +238,30 @@ def save_job(job: Job, path: Path) -> None:
 
 
 def with_defaults(raw: dict[str, Any]) -> dict[str, Any]:
-    """`raw` over the recipe of its field over the choices of its method."""
+    """`raw` over its preset of losses, over the recipe of its choices, over the choices of its method."""
     name = raw.get("method", Job.model_fields["method"].default)
     if not isinstance(name, str) or name not in METHODS:
         raise ValueError(f"method: {name!r} is not known{nearest(str(name), list(METHODS))}")
-    axes = METHODS[name].axes() | {k: v for k, v in as_dict(raw.get("model")).items() if k in METHODS[name].axes()}
-    recipe = RECIPES.get(str(axes["field"]), {})
-    if axes["appearance"] == "none":  # a changed colour could not be explained by anything
+    axes = METHODS[name].axes()
+    chosen = {k: v for k, v in as_dict(raw.get("model")).items() if k in axes and isinstance(v, str)}
+    if "appearance" in chosen and chosen["appearance"] != axes["appearance"]:
+        axes["fused"] = FUSED_AT.get(chosen["appearance"], "none")
+    axes |= chosen
+    recipe = merge(recipe_of(axes), {"model": axes})
+    preset = as_dict(raw.get("losses")).get("preset", recipe.get("losses", {}).get("preset"))
+    if isinstance(preset, str):
+        recipe = merge(recipe, {"losses": {"preset": preset, **PRESETS.get(preset, {})}})
+    return merge(recipe, raw)
+
+
+def recipe_of(axes: dict[str, str]) -> dict[str, Any]:
+    """What trains these choices well."""
+    recipe = RECIPES.get(axes["field"], {})
+    if axes["appearance"] in ("none", "embedding"):  # a changed colour could not be explained by anything
         recipe = merge(recipe, {"train": {"colour_jitter": 0.0}})
-    return merge(merge(recipe, {"model": axes}), raw)
+    if axes["transient"] == "uncertainty":  # as NeRF-W's code: two fields whose densities are compared, without noise
+        recipe = merge(recipe, {"model": {"mlp": {"density_noise": 0.0}}})
+    return recipe
 
 
 def parse_setting(setting: str) -> dict[str, Any]:

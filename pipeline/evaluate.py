@@ -36,17 +36,23 @@ from pipeline.checkpoint import (
 from pipeline.config import Job, load_job
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write
+from pipeline.fit import FitRecipe, fit_code
+from pipeline.landmark import Landmark
 from pipeline.lpips import LPIPS, find_lpips
 from pipeline.metrics import psnr, ssim_11, ssim_window3, to_8bit
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
-from pipeline.render import View, colour_view, read_appearance, render_view
+from pipeline.render import View, read_appearance, render_picture
 from pipeline.train import device_name
+from pipeline.truth import check_truth, elsewhere, mask_iou, reduced, truth_of
 
 log = logging.getLogger("crossray")
 
 LPIPS_SIDE = 31  # pixels; AlexNet has nothing left of a smaller picture
 AFFINE = "+affine"  # suffix of the control: colours fitted to the photo's left half by one affine map
+MASK_PHOTOS = 32  # training photos over which masks are compared with the truth, at most
+
+Codes = dict[tuple[int, str], torch.Tensor]  # (photo, what it was read from) -> appearance code that was fitted
 
 
 class Protocol(BaseModel):
@@ -54,11 +60,13 @@ class Protocol(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    appearance: Literal["whole", "left"]
+    appearance: Literal["whole", "left", "elsewhere"]
     scored: Literal["right", "whole"]
+    truth: Literal["photo", "clean"]
     rounding: Literal["truncate", "round"]
     ssim: Literal["window3", "window11"]
     mlp_samples: tuple[int, int]
+    fit: FitRecipe
 
 
 def parse_protocol(name: str) -> tuple[Protocol, int, bool]:
@@ -108,13 +116,17 @@ def load_run(
             )
         checkpoint = read_checkpoint(run / "checkpoints" / folder_name(step))
     device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
-    model = SceneModel(job.model, torch.zeros(2, 3)).to(device)  # the scene's box is one of its buffers
+    box = torch.zeros(2, 3)  # the scene's box is one of its buffers
+    model = SceneModel(job.model, box, checkpoint.meta["photos"]).to(device).requires_grad_(False)
     model.load_state_dict(checkpoint.model)
     return job, model.eval(), checkpoint
 
 
-def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict[str, Any]:
+def evaluate_run(run: Path, protocol_name: str, step: int | None = None, codes: Codes | None = None) -> dict[str, Any]:
     """Evaluate a run's checkpoint on its test photos; returns what metrics.json holds.
+
+    Args:
+        codes: appearance codes fitted for another protocol of the same checkpoint; new ones are added.
 
     Raises:
         CrossrayError: the run, the protocol or the shards cannot be used.
@@ -128,17 +140,18 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
     if not indices:
         raise CrossrayError(f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table")
     out = run / "eval" / protocol_name / checkpoint.folder.name
-    lpips = usable_lpips(photos, indices)
+    lpips = usable_lpips(photos, indices, protocol)
+    judge = Judge(model, photos, protocol, truth_of(job, photos) if protocol.truth == "clean" else None, codes)
 
     began = time.perf_counter()
     progress = Progress(f"evaluating {run.name} under {protocol_name}")
     rows = []
     for done, index in enumerate(indices):
-        view, picture = render_test_photo(model, photos, index, protocol)
+        view, picture = judge.render(index)
         if affine:
             picture = fit_colours(picture, photos.image(index))
         prediction = to_8bit(picture, protocol.rounding)
-        rows.append(score(prediction, photos, index, protocol, lpips))
+        rows.append(judge.score(prediction, index, lpips))
         save_png(out / f"{photos.records[index].key}.png", prediction)
         save_png(out / f"{photos.records[index].key}.depth.png", depth_picture(view))
         progress.update((done + 1) / len(indices), f"PSNR {np.mean([r['psnr'] for r in rows]):.2f}")
@@ -150,7 +163,8 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
         "checkpoint_sha256": checkpoint.meta["sha256"][MODEL],
         "method": job.method,
         "samples": list(samples_of(model, protocol) or ()) or "as in training",
-        "mean": {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k not in ("name", "key")},
+        "appearance_from": judge.appearance_from,
+        "mean": {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k not in ("name", "key")} | judge.masks(),
         "images": rows,
         "seconds": time.perf_counter() - began,
         "device": device_name(next(model.parameters()).device),
@@ -161,15 +175,92 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None) -> dict
     return result
 
 
-def usable_lpips(photos: Photos, indices: tuple[int, ...]) -> LPIPS | None:
+class Judge:
+    """One model under one protocol: what it may see of a test photo, and what its picture is compared with.
+
+    Args:
+        landmark: the truth behind the photos, for a protocol that scores against it.
+        codes: appearance codes that are already fitted; new ones are added.
+    """
+
+    def __init__(
+        self,
+        model: SceneModel,
+        photos: Photos,
+        protocol: Protocol,
+        landmark: Landmark | None,
+        codes: Codes | None = None,
+    ) -> None:
+        self.model, self.photos, self.protocol, self.landmark = model, photos, protocol, landmark
+        self.codes = {} if codes is None else codes
+
+    @property
+    def appearance_from(self) -> str:
+        """What appearances are read from. A learned code is fitted, which on scored pixels would be training on them:
+        so it sees the left half where others see the whole photo."""
+        if self.model.spec.appearance == "none":
+            return "nothing"
+        fitted = self.model.embedding is not None and self.protocol.appearance == "whole"
+        return "left" if fitted else self.protocol.appearance
+
+    def render(self, index: int) -> tuple[View, np.ndarray]:
+        """A test photo's view in the appearance that the protocol lets the model see."""
+        samples = samples_of(self.model, self.protocol)
+        return render_picture(self.model, self.photos.records[index], self.appearance(index), samples)
+
+    def appearance(self, index: int) -> torch.Tensor | None:
+        """F^a of a test photo."""
+        source, image, reference = index, self.photos.image(index), self.photos.reference(index)
+        if self.protocol.appearance == "elsewhere":
+            source = elsewhere(self.photos, index)
+            image = self.clean(source, index)
+            reference = reduced(image, self.photos.manifest.reference_downscale)
+        if self.appearance_from == "left":
+            reference = left_half(reference)
+        if self.model.embedding is None:
+            return read_appearance(self.model, reference)
+        key = (index, self.appearance_from)
+        if key not in self.codes:
+            columns = left_half(image).shape[1] if self.appearance_from == "left" else image.shape[1]
+            camera = self.photos.records[source]
+            self.codes[key] = fit_code(self.model, image, camera, columns, self.protocol.fit, seed=index)
+        return self.codes[key]
+
+    def clean(self, view: int, light: int) -> np.ndarray:
+        """The landmark in the view of one photo and the light of another, nobody there."""
+        assert self.landmark is not None
+        return self.landmark.truth(self.photos.records[view].name, self.photos.records[light].name)
+
+    def score(self, prediction: np.ndarray, index: int, lpips: LPIPS | None) -> dict[str, Any]:
+        """The metrics of one 8-bit prediction."""
+        truth = self.photos.image(index) if self.protocol.truth == "photo" else self.clean(index, index)
+        name, key = self.photos.records[index].name, self.photos.records[index].key
+        return {"name": name, "key": key, **score(prediction, truth, self.protocol, lpips, name)}
+
+    def masks(self) -> dict[str, float]:
+        """Where the truth is known: how well the model's masks agree with it, on training photos."""
+        if self.landmark is None:
+            return {}
+        train = self.photos.indices("train")
+        iou = mask_iou(self.model, self.photos, self.landmark, train[:: -(-len(train) // MASK_PHOTOS)])
+        return {} if iou is None else {"mask_iou": iou}
+
+
+def left_half(picture: np.ndarray) -> np.ndarray:
+    """The left half of (h, w, ...), with the middle column where the width is odd."""
+    return picture[:, : picture.shape[1] - picture.shape[1] // 2]
+
+
+def usable_lpips(photos: Photos, indices: tuple[int, ...], protocol: Protocol) -> LPIPS | None:
     """LPIPS where its weights are found and all pictures are large enough; else None, and the log says why."""
     lpips = find_lpips()
     if lpips is None:
         warn_once("LPIPS is left out: no weights found; CROSSRAY_LPIPS=/path/to/lpips_alex.npz names them")
         return None
     for record in (photos.records[i] for i in indices):
-        if min(record.height, record.width // 2) < LPIPS_SIDE:
-            warn_once(f"LPIPS is left out: half of {record.name} has a side under {LPIPS_SIDE} pixels")
+        width = record.width // 2 if protocol.scored == "right" else record.width
+        if min(record.height, width) < LPIPS_SIDE:
+            warn_once(f"LPIPS is left out: what is scored of {record.name} has a side under {LPIPS_SIDE} pixels")
             return None
     return lpips
 
@@ -180,42 +271,25 @@ def warn_once(text: str) -> None:
     log.warning(text)
 
 
-def render_test_photo(model: SceneModel, photos: Photos, index: int, protocol: Protocol) -> tuple[View, np.ndarray]:
-    """A photo's camera in the photo's own appearance, as far as the protocol lets the model see it."""
-    reference = photos.reference(index)
-    if protocol.appearance == "left":
-        reference = reference[:, : reference.shape[1] - reference.shape[1] // 2]
-    view = render_view(model, photos.records[index], samples=samples_of(model, protocol))
-    return view, colour_view(model, view, read_appearance(model, reference))
-
-
 def samples_of(model: SceneModel, protocol: Protocol) -> tuple[int, int] | None:
     """Sample counts of the rendering; None keeps those of training (the protocols only speak of the MLP field)."""
     return protocol.mlp_samples if model.spec.field == "mlp" else None
 
 
 def score(
-    prediction: np.ndarray, photos: Photos, index: int, protocol: Protocol, lpips: LPIPS | None
-) -> dict[str, Any]:
-    """The metrics of one 8-bit prediction."""
-    truth = photos.image(index)
+    prediction: np.ndarray, truth: np.ndarray, protocol: Protocol, lpips: LPIPS | None, name: str
+) -> dict[str, float]:
+    """The metrics of one 8-bit prediction against the 8-bit truth, both (h, w, 3); `name` is for messages."""
     start = truth.shape[1] // 2 if protocol.scored == "right" else 0
     prediction, truth = np.ascontiguousarray(prediction[:, start:]), np.ascontiguousarray(truth[:, start:])
     ssim, least = (ssim_window3, 3) if protocol.ssim == "window3" else (ssim_11, 11)
     if min(truth.shape[:2]) < least:
         raise CrossrayError(
-            f"{photos.records[index].name}: its scored part is {truth.shape[1]} x {truth.shape[0]} pixels, smaller "
+            f"{name}: its scored part is {truth.shape[1]} x {truth.shape[0]} pixels, smaller "
             f"than the SSIM window of {least}; evaluate at a smaller downscale"
         )
-    row: dict[str, Any] = {
-        "name": photos.records[index].name,
-        "key": photos.records[index].key,
-        "psnr": psnr(prediction, truth),
-        "ssim": ssim(prediction, truth),
-    }
-    if lpips is not None:
-        row["lpips"] = lpips.distance(prediction, truth)
-    return row
+    scores = {"psnr": psnr(prediction, truth), "ssim": ssim(prediction, truth)}
+    return scores if lpips is None else scores | {"lpips": lpips.distance(prediction, truth)}
 
 
 def fit_colours(picture: np.ndarray, photo: np.ndarray) -> np.ndarray:
@@ -257,13 +331,19 @@ def check_downscale(job: Job, protocol_name: str, downscale: int) -> None:
 def check_protocols(job: Job) -> None:
     """CrossrayError for a protocol that could only be refused after the training."""
     for name in job.evaluate.protocols:
-        check_downscale(job, name, parse_protocol(name)[1])
+        protocol, downscale, _ = parse_protocol(name)
+        check_downscale(job, name, downscale)
+        if protocol.truth == "clean":
+            check_truth(job)
 
 
 def run_protocols(job: Job) -> list[dict[str, Any]]:
     """Every protocol that the job asks for; what this checkpoint was scored under before is read, not done again."""
     newest = load_run(job.run)[2]
-    return [recorded(job.run, name, newest) or evaluate_run(job.run, name) for name in job.evaluate.protocols]
+    codes: Codes = {}
+    return [
+        recorded(job.run, name, newest) or evaluate_run(job.run, name, codes=codes) for name in job.evaluate.protocols
+    ]
 
 
 def recorded(run: Path, protocol_name: str, checkpoint: Checkpoint) -> dict[str, Any] | None:

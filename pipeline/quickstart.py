@@ -19,7 +19,6 @@ from rich.console import Console
 from rich.table import Table
 
 from model.scene_model import SceneModel
-from pipeline.batches import as_tensor
 from pipeline.config import Job, make_job, save_job
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import depth_picture, load_run
@@ -28,16 +27,16 @@ from pipeline.landmark import Landmark, write_landmark
 from pipeline.metrics import psnr, ssim_11, to_8bit
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import shown
-from pipeline.render import View, colour_view, read_appearance, render_view
+from pipeline.render import View, colour_view, predicted_mask, read_appearance, render_view
 from pipeline.report import Row, write_overview, write_report
 from pipeline.shards import cut_shards
+from pipeline.truth import mask_iou
 
 log = logging.getLogger("crossray")
 
 TRAIN_SECONDS = 100.0
 SIZE = 128  # long side of a photo, pixels
 PHOTOS = {"train": 144, "val": 8, "test": 8}
-MASK_THRESHOLD = 0.5
 SCORES = {
     "psnr": "test views in their own light, against the truth without tourists [dB]",
     "psnr_cross": "the same, the light read from another view [dB]",
@@ -164,15 +163,9 @@ class Scored:
             scores["ssim"].append(ssim_11(picture, truth))
         return {k: float(np.mean(v)) for k, v in scores.items()}
 
-    def mask_iou(self) -> float:
+    def mask_iou(self) -> float | None:
         """Intersection over union of predicted and true masks, pooled over all training photos."""
-        both = either = 0
-        for index in self.photos.indices("train"):
-            predicted = self.predicted_mask(index) > MASK_THRESHOLD
-            true = self.landmark.mask(self.name(index))
-            both += int((predicted & true).sum())
-            either += int((predicted | true).sum())
-        return both / max(either, 1)
+        return mask_iou(self.model, self.photos, self.landmark, self.photos.indices("train"))
 
     def rows(self) -> list[Row]:
         """Rows of the report: three test photos, and the three training photos with the most transients."""
@@ -192,7 +185,7 @@ class Scored:
                         "NeRF, same budget": self.nerf_picture(index),
                         "Crossray": self.coloured(view, self.photos.reference(index)),
                         "in another photo's light": self.coloured(view, self.photos.reference(lent)),
-                        "predicted mask": to_8bit(self.predicted_mask(index), "round"),
+                        "predicted mask": to_8bit(self.mask(index), "round"),
                         "true mask": self.landmark.mask(name).astype(np.uint8) * 255,
                         "depth": depth_picture(view),
                     },
@@ -205,6 +198,12 @@ class Scored:
         means = [self.photos.reference(i).mean(axis=(0, 1)) for i in (a, b)]
         return float(np.linalg.norm(means[0] - means[1]))
 
+    def mask(self, index: int) -> np.ndarray:
+        """Transient probability (h, w) of a photo."""
+        mask = predicted_mask(self.model, self.photos, index)
+        assert mask is not None
+        return mask
+
     def name(self, index: int) -> str:
         """The photo's file name."""
         return self.photos.records[index].name
@@ -216,12 +215,6 @@ class Scored:
     def nerf_picture(self, index: int) -> np.ndarray:
         """Plain NeRF's 8-bit picture of a photo's view."""
         return to_8bit(colour_view(self.nerf, render_view(self.nerf, self.photos.records[index]), None), "round")
-
-    def predicted_mask(self, index: int) -> np.ndarray:
-        """Transient probability (h, w) of a photo."""
-        image = self.photos.image(index)
-        reference = as_tensor(self.photos.reference(index), torch.device("cpu"))
-        return self.model.transient_mask(reference, image.shape[:2]).numpy()
 
 
 def print_summary(console: Console, out: Path, summary: dict[str, Any], report: Path) -> None:

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
-from model.scene_model import Batch, SceneModel
+from model.scene_model import Batch, SceneModel, needs_other
 from pipeline.batches import TrainingPhotos, jitter_colours
 from pipeline.board import psnr_of, write_pictures, write_scalars
 from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
@@ -77,7 +77,8 @@ class Work:
 
     def batch(self, step: int) -> Batch:
         """The pixels, rays and references of these patches."""
-        batch = self.data.batch(self.patches(step), self.job.patch.size, others=self.job.losses.appearance > 0)
+        others = needs_other(self.job.model, self.job.losses)
+        batch = self.data.batch(self.patches(step), self.job.patch.size, others)
         strength = self.job.train.colour_jitter
         if strength == 0:
             return batch
@@ -131,7 +132,7 @@ def train(job: Job, context: Context) -> dict[str, Any]:
     """
     torch.set_num_threads(job.threads)
     photos = open_photos(job.shards)
-    data = TrainingPhotos(photos, context.device, job.model.pixel_center)
+    data = TrainingPhotos(photos, context.device, job.model.pixel_center, masks=job.model.transient == "fixed")
     work = Work(job, context, data, epoch_length(job, data.sizes, context.world_size))
     model = build_model(job, photos, context.device)
     optimiser = build_optimiser(model, job.train)
@@ -174,6 +175,7 @@ def train(job: Job, context: Context) -> dict[str, Any]:
                     "seconds": clock.seconds,
                     "finished": clock.done,
                     "world_size": context.world_size,
+                    "photos": len(data.index),
                 }
                 save_checkpoint(checkpoints(job), clock.step, model.state_dict(), optimiser.state_dict(), meta)
                 prune(checkpoints(job), job.train.keep_checkpoints)
@@ -221,7 +223,7 @@ def forward(work: Work, ddp: torch.nn.Module, step: int) -> tuple[dict[str, Tens
 def build_model(job: Job, photos: Photos, device: torch.device) -> SceneModel:
     """The job's model with its initial weights, which depend on the seed alone."""
     torch.manual_seed(job.patch.seed)
-    model = SceneModel(job.model, torch.tensor(photos.manifest.scene.box)).to(device)
+    model = SceneModel(job.model, torch.tensor(photos.manifest.scene.box), len(photos.indices("train"))).to(device)
     model.use_bfloat16 = uses_bfloat16(job, device)
     model.freeze_idle(job.losses)
     return model

@@ -15,23 +15,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from model.appearance.crossray import ContentStatistics, StyleStatistics
+from model.appearance.crossray import ContentStatistics, StyleStatistics, identities, no_moment, second_moment
 
 GRID = 8  # cells a side of an embedding
 
 
 class CompactEncoder(nn.Module):
-    """Four strided convolutions and an average pool: images (P, 3, h, w) in [0, 1] -> F^a (P, C, 8, 8) in (-1, 1)."""
+    """Strided convolutions and an average pool: images (P, 3, h, w) in [0, 1] -> F^a (P, C, 8, 8) in (-1, 1)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Conv2d(3, 16, 3, stride=2, padding=1),
-            nn.LeakyReLU(0.2),
-            nn.Conv2d(16, 32, 3, stride=2, padding=1),
-            nn.LeakyReLU(0.2),
-            nn.Conv2d(32, 48, 3, stride=2, padding=1),
-            nn.LeakyReLU(0.2),
+            *strided_convolutions(),
             nn.AdaptiveAvgPool2d(GRID),
             nn.Conv2d(48, channels, 1),
             nn.Tanh(),
@@ -42,41 +37,55 @@ class CompactEncoder(nn.Module):
         return self.layers(2 * image - 1)
 
 
+def strided_convolutions() -> nn.Sequential:
+    """Images (P, 3, h, w) -> (P, 48, ceil(h/8), ceil(w/8))."""
+    return nn.Sequential(
+        nn.Conv2d(3, 16, 3, stride=2, padding=1),
+        nn.LeakyReLU(0.2),
+        nn.Conv2d(16, 32, 3, stride=2, padding=1),
+        nn.LeakyReLU(0.2),
+        nn.Conv2d(32, 48, 3, stride=2, padding=1),
+        nn.LeakyReLU(0.2),
+    )
+
+
 class CompactTransform(nn.Module):
     """T from second moments of compressed features, near the identity at the start.
 
     Args:
         channels: C of a feature and of an embedding.
         compressed: c, side of the matrices.
+        covariance: False leaves the second moments out: T(F) = F + U K (F - mu_cr) + v(mu_a). A control: what is left
+            is the means alone.
     """
 
-    def __init__(self, channels: int, compressed: int = 16) -> None:
+    def __init__(self, channels: int, compressed: int = 16, covariance: bool = True) -> None:
         super().__init__()
         self.compressed = compressed
+        self.moment_size = compressed if covariance else 0
         self.compress = nn.Linear(channels, compressed, bias=False)
-        self.content = nn.Linear(channels, compressed)
-        self.style = nn.Linear(channels, compressed)
-        self.content_matrix = nn.Linear(compressed**2, compressed**2)
-        self.style_matrix = nn.Linear(compressed**2, compressed**2)
+        self.content = nn.Linear(channels, compressed) if covariance else None
+        self.style = nn.Linear(channels, compressed) if covariance else None
+        self.content_matrix = nn.Linear(compressed**2, compressed**2) if covariance else None
+        self.style_matrix = nn.Linear(compressed**2, compressed**2) if covariance else None
         self.unzip = nn.Linear(compressed, channels, bias=False)
         self.shift = nn.Sequential(nn.Linear(channels, 64), nn.LeakyReLU(0.2), nn.Linear(64, channels))
         for layer in (self.content_matrix, self.style_matrix):
-            nn.init.normal_(layer.weight, std=0.1 / compressed)
-            nn.init.zeros_(layer.bias)
+            if layer is not None:
+                nn.init.normal_(layer.weight, std=0.1 / compressed)
+                nn.init.zeros_(layer.bias)
         nn.init.normal_(self.unzip.weight, std=0.1 / compressed**0.5)
 
     def content_statistics(self, features: Tensor) -> ContentStatistics:
         """Mean (P, C) and second moment (P, c, c) of the features (P, N, C) of the rays at hand."""
         mean = features.mean(dim=1)
-        z = self.content(features - mean[:, None])
-        return ContentStatistics(mean, z.transpose(1, 2) @ z / z.shape[1])
+        return ContentStatistics(mean, moment(self.content, features, mean))
 
     def style_statistics(self, embedding: Tensor) -> StyleStatistics:
         """Mean (P, C) and second moment (P, c, c) of embeddings (P, C, h, w)."""
         cells = embedding.flatten(2).transpose(1, 2)
         mean = cells.mean(dim=1)
-        z = self.style(cells - mean[:, None])
-        return StyleStatistics(mean, z.transpose(1, 2) @ z / z.shape[1])
+        return StyleStatistics(mean, moment(self.style, cells, mean))
 
     def affine(self, content: ContentStatistics, style: StyleStatistics) -> tuple[Tensor, Tensor]:
         """W (P, C, C) and b (P, C) with T(F) = W F + b."""
@@ -85,10 +94,17 @@ class CompactTransform(nn.Module):
         b = self.shift(style.mean) - (correction @ content.mean[..., None]).squeeze(-1)
         return torch.eye(correction.shape[-1], device=b.device) + correction, b
 
-    def matrix(self, layer: nn.Linear, gram: Tensor) -> Tensor:
-        """I + FC(gram), (P, c, c)."""
-        c = self.compressed
-        return torch.eye(c, device=gram.device) + layer(gram.flatten(1)).view(-1, c, c)
+    def matrix(self, layer: nn.Linear | None, gram: Tensor) -> Tensor:
+        """I + FC(gram), (P, c, c); just I without a layer."""
+        identity = identities(gram, self.compressed)
+        return identity if layer is None else identity + layer(gram.flatten(1)).view_as(identity)
+
+
+def moment(per_ray: nn.Linear | None, features: Tensor, mean: Tensor) -> Tensor:
+    """Second moment (P, c, c) of per_ray(features - mean) over rays or cells (P, N, C); (P, 0, 0) without a layer."""
+    if per_ray is None:
+        return no_moment(features)
+    return second_moment(features, lambda block: per_ray(block - mean[:, None]))
 
 
 def at_size(images: list[Tensor], size: tuple[int, int]) -> Tensor:

@@ -19,6 +19,7 @@ not re-centred.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -56,22 +57,41 @@ class MomentNet(nn.Module):
         self.read_off = nn.Linear(compressed**2, compressed**2)
 
     def gram(self, features: Tensor, mean: Tensor) -> Tensor:
-        """Second moment (P, c, c) of z = per_ray(features - mean) over the rays; z itself is not centred.
-
-        Without gradients the rays go through in blocks of a fixed size, so that a view of 500,000 rays needs
-        no more memory than a block; the result does not depend on how a caller chunks its rendering.
-        """
-        centre = mean[:, None, :]
-        if torch.is_grad_enabled():
-            total = outer_sum(self.per_ray(features - centre))
-        else:
-            blocks = features.split(BLOCK, dim=1)
-            total = torch.stack([outer_sum(self.per_ray(block - centre)) for block in blocks]).sum(0)
-        return total / features.shape[1]
+        """Second moment (P, c, c) of z = per_ray(features - mean) over the rays; z itself is not centred."""
+        return second_moment(features, lambda block: self.per_ray(block - mean[:, None]))
 
     def matrix(self, gram: Tensor) -> Tensor:
         """(P, c, c) -> (P, c, c)."""
         return self.read_off(gram.flatten(1)).view_as(gram)
+
+
+class NoMoment(nn.Module):
+    """In the place of a MomentNet: looks at nothing, and its matrix is the identity."""
+
+    def __init__(self, compressed: int) -> None:
+        super().__init__()
+        self.compressed = compressed
+
+    def gram(self, features: Tensor, mean: Tensor) -> Tensor:
+        """(P, 0, 0)."""
+        return no_moment(features)
+
+    def matrix(self, gram: Tensor) -> Tensor:
+        """P identities (P, c, c)."""
+        return identities(gram, self.compressed)
+
+
+def second_moment(features: Tensor, z: Callable[[Tensor], Tensor]) -> Tensor:
+    """mean_n z_n z_n^T (P, c, c) of z(features), features (P, N, C); z (P, N, c) must look at each ray alone.
+
+    Without gradients the rays go through in blocks of a fixed size, so that a view of 500,000 rays needs
+    no more memory than a block; the result does not depend on how a caller chunks its rendering.
+    """
+    if torch.is_grad_enabled():
+        total = outer_sum(z(features))
+    else:
+        total = torch.stack([outer_sum(z(block)) for block in features.split(BLOCK, dim=1)]).sum(0)
+    return total / features.shape[1]
 
 
 def outer_sum(z: Tensor) -> Tensor:
@@ -79,20 +99,43 @@ def outer_sum(z: Tensor) -> Tensor:
     return z.mT @ z
 
 
-class ReleasedTransform(nn.Module):
-    """T as released. With the defaults, 2,140,704 parameters; weights start as torch's defaults, as there."""
+def no_moment(features: Tensor) -> Tensor:
+    """The second moment (P, 0, 0) of a transform that uses none."""
+    return features.new_zeros(len(features), 0, 0)
 
-    def __init__(self, channels: int = 64, compressed: int = 32) -> None:
+
+def identities(gram: Tensor, side: int) -> Tensor:
+    """One identity (side, side) for each row of `gram`: (P, side, side)."""
+    return torch.eye(side, dtype=gram.dtype, device=gram.device).expand(len(gram), side, side)
+
+
+def check_rays(features: Tensor) -> None:
+    """ValueError unless `features` are (P, N > 0, C)."""
+    if features.ndim != 3 or features.shape[1] == 0:
+        raise ValueError(f"statistics need features (P, N > 0, C), not {tuple(features.shape)}")
+
+
+class ReleasedTransform(nn.Module):
+    """T as released. With the defaults, 2,140,704 parameters; weights start as torch's defaults, as there.
+
+    Args:
+        channels: C of a feature and of an embedding.
+        compressed: c, side of the matrices.
+        covariance: False leaves the second moments out: T(F) = expand(compress(F - mu_cr)) + mu_a. A control: what
+            is left is the means alone.
+    """
+
+    def __init__(self, channels: int = 64, compressed: int = 32, covariance: bool = True) -> None:
         super().__init__()
+        self.moment_size = compressed if covariance else 0
         self.compress = nn.Linear(channels, compressed)
         self.expand = nn.Linear(compressed, channels)
-        self.content = MomentNet(channels, compressed)
-        self.style = MomentNet(channels, compressed)
+        self.content = MomentNet(channels, compressed) if covariance else NoMoment(compressed)
+        self.style = MomentNet(channels, compressed) if covariance else NoMoment(compressed)
 
     def content_statistics(self, features: Tensor) -> ContentStatistics:
         """Of features (P, N, C). The order of the rays does not matter; ValueError if there are none."""
-        if features.ndim != 3 or features.shape[1] == 0:
-            raise ValueError(f"statistics need features (P, N > 0, C), not {tuple(features.shape)}")
+        check_rays(features)
         mean = features.mean(dim=1)
         return ContentStatistics(mean, self.content.gram(features, mean))
 

@@ -4,6 +4,9 @@ Space: points are put into the scene's box, [-1, 1] an axis, and what lies outsi
 [-2, 2], so a far background costs no more than the landmark. What a ray sees behind its last sample (sky) is a feature
 of its direction alone, and goes through compositing and decoding like any other sample.
 
+Where the field reads appearance codes, the trunk gives a bottleneck instead of features, and a second network makes
+features of bottleneck and code; the background reads the code, too.
+
 Notation: R rays, S samples a ray, edges e (R, S+1) with t at the middle of each interval.
 """
 
@@ -13,16 +16,19 @@ import torch
 from torch import Tensor, nn
 
 from model.encoding import positional_encoding
-from model.fields.base import Level, March, Rays
+from model.fields.base import Codes, Level, March, Rays, at_least_float32, at_points, points, transient_samples
 from model.fields.hashgrid import HashEncoding
-from model.methods import HashSpec
+from model.methods import CODE, HashSpec
 from model.sampling import sample_pdf
+from model.transient.uncertainty import TransientHead
 from model.volume import render_weights
 
 DIRECTION_FREQUENCIES = 2
 PROPOSAL_LEVELS = 5
 PROPOSAL_LOG2_ENTRIES = 13
 PROPOSAL_RESOLUTION = (8, 128)
+TRANSIENT_DEPTH = 2  # layers of the transient head
+TRANSIENT_BIAS = -3.0  # the transient field starts almost empty: softplus(-3) is 0.05 a scene unit
 
 
 class HashField(nn.Module):
@@ -33,11 +39,15 @@ class HashField(nn.Module):
         channels: C of a feature; 3 with `rgb`.
         rgb: features are colours, kept in (0, 1) by a sigmoid.
         box: (2, 3) lower and upper corner of the scene's box, scene units.
+        coded: features depend on an appearance code.
+        transient: beside the features stands a transient head.
     """
 
     box: Tensor
 
-    def __init__(self, spec: HashSpec, channels: int, rgb: bool, box: Tensor) -> None:
+    def __init__(
+        self, spec: HashSpec, channels: int, rgb: bool, box: Tensor, coded: bool = False, transient: bool = False
+    ) -> None:
         super().__init__()
         self.spec = spec
         self.rgb = rgb
@@ -45,15 +55,24 @@ class HashField(nn.Module):
         self.proposal_grid = HashEncoding(PROPOSAL_LEVELS, PROPOSAL_LOG2_ENTRIES, *PROPOSAL_RESOLUTION)
         self.proposal = mlp(self.proposal_grid.out_channels, 16, 1)
         self.grid = HashEncoding(spec.levels, spec.log2_entries, spec.min_resolution, spec.max_resolution)
-        self.trunk = mlp(self.grid.out_channels, spec.width, 1 + channels)
-        self.background = mlp(3 * (1 + 2 * DIRECTION_FREQUENCIES), 32, channels)
+        inner = spec.width if coded else channels
+        self.trunk = mlp(self.grid.out_channels, spec.width, 1 + inner)
+        self.background = mlp(3 * (1 + 2 * DIRECTION_FREQUENCIES) + (CODE if coded else 0), 32, channels)
+        self.coloured = mlp(inner + CODE, spec.width, channels) if coded else None
+        self.transient = (
+            TransientHead(inner, channels, rgb, spec.width, TRANSIENT_DEPTH, TRANSIENT_BIAS) if transient else None
+        )
 
     def points_a_ray(self, samples: tuple[int, int] | None = None) -> int:
         """See Field."""
         return max(samples or (self.spec.proposal_samples, self.spec.samples))
 
     def march(
-        self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
+        self,
+        rays: Rays,
+        generator: torch.Generator | None = None,
+        samples: tuple[int, int] | None = None,
+        codes: Codes = Codes(),
     ) -> March:
         """See Field. The loss `interlevel` keeps the proposal's weights an upper bound of the field's."""
         num_proposal, num_samples = samples or (self.spec.proposal_samples, self.spec.samples)
@@ -63,13 +82,32 @@ class HashField(nn.Module):
 
         fine_edges = self.resample(edges, proposal_weights.detach(), num_samples, generator)
         t, delta = 0.5 * (fine_edges[:, 1:] + fine_edges[:, :-1]), fine_edges.diff(dim=-1)
-        density, features = self.density_and_features(points(rays, t))
+        density, inner = self.density_and_inner(points(rays, t))
         weights = render_weights(density, delta)
-        background = self.activate(self.background(positional_encoding(rays.directions, DIRECTION_FREQUENCIES)).float())
+        level = Level(t, weights, *self.seen(inner, rays.directions, codes.appearance))
         losses = {}
         if generator is not None:
             losses["interlevel"] = interlevel_loss(fine_edges, weights.detach(), edges, proposal_weights)
-        return March([Level(t, weights, features, background)], losses)
+        other = transient = None
+        if codes.other is not None:  # as in the faithful field, only the colour layers learn from the other appearance
+            other = Level(t, weights, *self.seen(inner.detach(), rays.directions, codes.other))
+        if codes.transient is not None and self.transient is not None:
+            transient = transient_samples(self.transient(inner, at_points(codes.transient)), density, delta)
+        return March([level], losses, other, transient)
+
+    def seen(self, inner: Tensor, directions: Tensor, code: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Features (R, S, C) of points and (R, C) of the background in the rays' appearance.
+
+        inner: (R, S, .), what the trunk knows of each point. code: (R, CODE) where the field reads one.
+        """
+        looked = positional_encoding(directions, DIRECTION_FREQUENCIES)
+        if self.coloured is not None:
+            if code is None:
+                raise ValueError("this field reads appearance codes, and none was given")
+            looked = torch.cat([looked, code], dim=-1)
+            inner = self.coloured(torch.cat([inner, code[:, None].expand(-1, inner.shape[1], -1)], dim=-1))
+        background = self.background(looked)
+        return self.activate(at_least_float32(inner)), self.activate(at_least_float32(background))
 
     def freeze_proposal(self) -> None:
         """Without its loss the proposal stays as it is."""
@@ -81,14 +119,14 @@ class HashField(nn.Module):
         raw = self.proposal(self.proposal_grid(self.contract(x).flatten(0, -2)))
         return self.density(raw[..., 0]).view(x.shape[:-1])
 
-    def density_and_features(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (...,) and features (..., C) at points (..., 3)."""
-        raw = self.trunk(self.grid(self.contract(x).flatten(0, -2))).float().view(*x.shape[:-1], -1)
-        return self.density(raw[..., 0]), self.activate(raw[..., 1:])
+    def density_and_inner(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Density (...,) at points (..., 3), and (..., .): features without their activation, or the bottleneck."""
+        raw = at_least_float32(self.trunk(self.grid(self.contract(x).flatten(0, -2)))).view(*x.shape[:-1], -1)
+        return self.density(raw[..., 0]), raw[..., 1:]
 
     def density(self, raw: Tensor) -> Tensor:
         """exp(raw + bias): unlike softplus it starts low and moves fast, so no fog is left between the cameras."""
-        return torch.exp((raw.float() + self.spec.density_bias).clamp(max=12))
+        return torch.exp((at_least_float32(raw) + self.spec.density_bias).clamp(max=12))
 
     def activate(self, features: Tensor) -> Tensor:
         """Colours are kept in (0, 1); features are free."""
@@ -118,11 +156,6 @@ class HashField(nn.Module):
 def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
     """One hidden layer, ReLU."""
     return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, outputs))
-
-
-def points(rays: Rays, t: Tensor) -> Tensor:
-    """Points (R, S, 3) at distances t (R, S)."""
-    return rays.origins[:, None] + t[..., None] * rays.directions[:, None]
 
 
 def uniform_edges(near: Tensor, far: Tensor, count: int, generator: torch.Generator | None) -> Tensor:

@@ -1,4 +1,4 @@
-"""The radiance field as one large MLP: position and direction -> density and features (released code)."""
+"""The radiance field as one large MLP: position and direction -> density and features (released codes)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from model.encoding import positional_encoding
 class RadianceMLP(nn.Module):
     """NeRF's MLP whose head gives `out_channels` features in (0, 1) instead of a colour.
 
-    Appearance never enters: density and features are those of the place, and all conditioning comes after
-    rendering. With the defaults, 619,073 parameters. Weights start as torch's defaults, as in the released
-    code.
+    CR-NeRF's has no code: density and features are those of the place, and all conditioning comes after rendering.
+    NeRF-W and Ha-NeRF give the directional layer an appearance code beside the direction; density never sees it. With
+    the defaults, 619,073 parameters. Weights start as torch's defaults, as in the released code.
     """
 
     def __init__(
@@ -25,6 +25,7 @@ class RadianceMLP(nn.Module):
         skip: int = 4,
         xyz_frequencies: int = 15,
         dir_frequencies: int = 4,
+        code_channels: int = 0,
     ) -> None:
         """`skip`: index of the layer that sees the encoded position once more, in front of its input."""
         super().__init__()
@@ -37,7 +38,7 @@ class RadianceMLP(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(channels, width) for channels in inputs)
         self.density = nn.Linear(width, 1)
         self.bottleneck = nn.Linear(width, width)
-        self.directional = nn.Linear(width + dir_channels, width // 2)
+        self.directional = nn.Linear(width + dir_channels + code_channels, width // 2)
         self.head = nn.Linear(width // 2, out_channels)
 
     def trunk(self, xyz: Tensor) -> Tensor:
@@ -50,14 +51,25 @@ class RadianceMLP(nn.Module):
             h = torch.relu(layer(h))
         return h
 
-    def forward(self, xyz: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, xyz: Tensor, direction: Tensor, code: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Density (...,) > 0 in 1 / scene unit and features (..., out_channels) in (0, 1).
 
         xyz: (..., 3). direction: unit, (..., 3), or anything that broadcasts: (R, 1, 3) serves all samples of
-        a ray.
+        a ray. code: (..., code_channels), likewise.
         """
         h = self.trunk(xyz)
-        density = functional.softplus(self.density(h)).squeeze(-1)
-        encoded = positional_encoding(direction, self.dir_frequencies).expand(*h.shape[:-1], -1)
-        seen = torch.relu(self.directional(torch.cat([self.bottleneck(h), encoded], dim=-1)))
-        return density, torch.sigmoid(self.head(seen))
+        return self.density_at(h), self.features_at(self.bottleneck(h), direction, code)
+
+    def density_at(self, h: Tensor) -> Tensor:
+        """Density (...,) from the trunk's output (..., width)."""
+        return functional.softplus(self.density(h)).squeeze(-1)
+
+    def features_at(self, bottleneck: Tensor, direction: Tensor, code: Tensor | None = None) -> Tensor:
+        """Features (..., out_channels) from the bottleneck (..., width), as seen from `direction` in the appearance
+        `code`.
+        """
+        inputs = [bottleneck, positional_encoding(direction, self.dir_frequencies)]
+        if code is not None:
+            inputs.append(code.to(bottleneck.dtype))
+        inputs = [x.expand(*bottleneck.shape[:-1], -1) for x in inputs]
+        return torch.sigmoid(self.head(torch.relu(self.directional(torch.cat(inputs, dim=-1)))))

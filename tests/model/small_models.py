@@ -14,20 +14,29 @@ MLP = MLPSpec(width=16, coarse_samples=6, fine_samples=6)
 HASH = HashSpec(levels=3, log2_entries=8, max_resolution=32, width=16, proposal_samples=8, samples=6)
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
-# Every row of the table, and ours once more with the parts that its recipe picks.
-ROWS = [*METHODS, "crossray-compact"]
+PHOTOS = 4  # training photos
+
+# Every row of the table, and each once more on the fast field with the parts that its recipe picks.
+ROWS = [*METHODS, *(f"{name}-fast" for name in METHODS)]
+TRANSFORMS = ["crnerf-mean_only", "crnerf-closed_form", "crossray-mean_only-fast", "crossray-closed_form-fast"]
 
 
 def small_spec(row: str) -> ModelSpec:
     """The row's choices with small parts; the released parts have one size only."""
-    compact = row.endswith("-compact")
-    spec = ModelSpec(**METHODS[row.removesuffix("-compact")].axes(), mlp=MLP, hash=HASH)
-    return replace(spec, channels=8, encoder="compact", segmenter="unet") if compact else spec
+    fast = row.endswith("-fast")
+    name = row.removesuffix("-fast")
+    transform = name.partition("-")[2]
+    if transform in ("mean_only", "closed_form"):
+        name = name.removesuffix(f"-{transform}")
+    spec = ModelSpec(**METHODS[name].axes(), mlp=MLP, hash=HASH)
+    if transform in ("mean_only", "closed_form"):
+        spec = replace(spec, transform=transform)
+    return replace(spec, field="hash", channels=8, encoder="compact", segmenter="unet") if fast else spec
 
 
 def small_model(row: str) -> SceneModel:
     torch.manual_seed(0)
-    model = SceneModel(small_spec(row), BOX)
+    model = SceneModel(small_spec(row), BOX, PHOTOS)
     if model.spec.segmenter == "unet" and model.segmenter is not None:
         # It starts with zeros in its last layer: a constant mask, and no gradient behind it.
         torch.nn.init.normal_(model.segmenter.out.weight, std=0.5)
@@ -47,7 +56,7 @@ def small_rays(count: int, seed: int = 0) -> Rays:
     return Rays(origins, directions, near, near + 3.0)
 
 
-def small_batch(patches: int = 2, k: int = 8, seed: int = 0) -> Batch:
+def small_batch(patches: int = 2, k: int = 16, seed: int = 0) -> Batch:
     generator = torch.Generator().manual_seed(seed)
     sizes = [(18, 26), (26, 18), (20, 20)]
 
@@ -58,6 +67,8 @@ def small_batch(patches: int = 2, k: int = 8, seed: int = 0) -> Batch:
         rays=small_rays(patches * k * k, seed),
         colours=torch.rand(patches, k * k, 3, generator=generator),
         positions=torch.rand(patches, k * k, 2, generator=generator),
+        photos=torch.randint(PHOTOS, (patches,), generator=generator),
         references=photos(0),
         others=photos(1),
+        masks=torch.rand(patches, k * k, generator=generator),
     )

@@ -6,7 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+import model.appearance.crossray as crossray
 from model.appearance.compact import GRID, CompactEncoder, CompactTransform, at_size
+from model.appearance.crossray import ContentStatistics
 
 P, N, C, SMALL = 2, 40, 6, 4
 
@@ -152,3 +154,58 @@ def test_area_resize_by_hand():
     assert out.shape == (2, 3, 1, 2)
     assert out[0, 0].tolist() == [[2.5, 4.5]]
     torch.testing.assert_close(out[1], torch.full((3, 1, 2), 0.25))
+
+
+def means_only() -> CompactTransform:
+    torch.manual_seed(0)
+    transform = CompactTransform(C, compressed=SMALL, covariance=False)
+    for parameter in transform.parameters():
+        parameter.data += 0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
+    return transform
+
+
+def test_without_covariance_only_compression_and_means_are_left():
+    transform = means_only()
+    features, embedding = data()
+    W, b = affine(transform, features, embedding)
+    assert (W.shape, b.shape) == ((P, C, C), (P, C))
+    UK = transform.unzip.weight @ transform.compress.weight
+    expected = [
+        torch.stack([f + UK @ (f - F.mean(0)) + transform.shift(S.mean(0)) for f in F])
+        for F, S in zip(features, embedding.flatten(2).mT, strict=True)
+    ]
+    torch.testing.assert_close(features @ W.mT + b[:, None], torch.stack(expected), atol=1e-5, rtol=1e-5)
+    assert {name.split(".")[0] for name, _ in transform.named_parameters()} == {"compress", "unzip", "shift"}
+
+
+@pytest.mark.parametrize("covariance", [True, False])
+def test_the_map_depends_on_covariances_exactly_where_it_should(covariance, transform):
+    transform = transform if covariance else means_only()
+    features, embedding = data()
+    mean = features.mean(1, keepdim=True)
+    changed, turned = mean + 3 * (features - mean), embedding.flip(1)
+    turned = turned - turned.mean((2, 3), keepdim=True) + embedding.mean((2, 3), keepdim=True)
+    W, b = affine(transform, features, embedding)
+    for x, style in ((changed, embedding), (features, turned)):
+        other = affine(transform, x, style)
+        assert torch.allclose(W, other[0], atol=1e-6) != covariance
+        assert torch.allclose(b, other[1], atol=1e-6) != covariance
+
+
+def test_the_moment_size_is_the_side_of_the_statistics(transform):
+    features, embedding = data()
+    for module, side in ((transform, SMALL), (means_only(), 0)):
+        assert module.moment_size == side
+        assert module.content_statistics(features).gram.shape == (P, side, side)
+        assert module.style_statistics(embedding).gram.shape == (P, side, side)
+
+
+def test_blocks_bound_memory_and_change_nothing(transform, monkeypatch):
+    features, _ = data()
+    whole = transform.content_statistics(features)
+    monkeypatch.setattr(crossray, "BLOCK", 7)
+    sizes = []
+    transform.content.register_forward_hook(lambda module, args, out: sizes.append(out.shape[1]))
+    with torch.no_grad():
+        torch.testing.assert_close(transform.content_statistics(features), ContentStatistics(*whole))
+    assert sizes == [7] * 5 + [5]

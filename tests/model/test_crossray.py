@@ -156,6 +156,69 @@ def test_no_rays_are_refused(transform):
         transform.content_statistics(torch.zeros(2, 0, 6))
 
 
+def squeezed(features: Tensor) -> Tensor:
+    """Other features with the same mean and another covariance."""
+    mean = features.mean(1, keepdim=True)
+    mix = torch.randn(features.shape[-1], features.shape[-1], generator=torch.Generator().manual_seed(3))
+    return mean + (features - mean) @ mix
+
+
+def means_only() -> ReleasedTransform:
+    torch.manual_seed(0)
+    return ReleasedTransform(channels=6, compressed=4, covariance=False)
+
+
+def test_without_covariance_only_compression_and_means_are_left():
+    transform = means_only()
+    features, reference = data()
+    content, style = transform.content_statistics(features), transform.style_statistics(reference)
+    assert content.gram.shape == style.gram.shape == (2, 0, 0)
+    assert torch.equal(transform.matrix(content, style), torch.eye(4).expand(2, 4, 4))
+    W, b = transform.affine(content, style)
+    expected = [
+        transform.expand(transform.compress(F - F.mean(0))) + S.mean(0)
+        for F, S in zip(features, reference.flatten(2).mT, strict=True)
+    ]
+    torch.testing.assert_close(features @ W.mT + b[:, None], torch.stack(expected), atol=1e-6, rtol=1e-5)
+    # Of the 2,140,704 parameters the two moment networks are all but 64 32 + 32 and 32 64 + 64.
+    assert sum(p.numel() for p in ReleasedTransform(covariance=False).parameters()) == 4_192
+
+
+@pytest.mark.parametrize("covariance", [True, False])
+def test_the_map_depends_on_covariances_exactly_where_it_should(covariance, transform):
+    transform = transform if covariance else means_only()
+    features, reference = data()
+    before = transform.affine(transform.content_statistics(features), transform.style_statistics(reference))
+    other = squeezed(reference.flatten(2).mT).mT.unflatten(2, (5, 3))
+    changed = [
+        transform.affine(transform.content_statistics(squeezed(features)), transform.style_statistics(reference)),
+        transform.affine(transform.content_statistics(features), transform.style_statistics(other)),
+    ]
+    for W, b in changed:
+        assert torch.allclose(W, before[0], atol=1e-6) != covariance
+        assert torch.allclose(b, before[1], atol=1e-5) != covariance
+    moved = transform.affine(transform.content_statistics(features + 1), transform.style_statistics(reference))
+    torch.testing.assert_close(moved[0], before[0])
+    assert not torch.allclose(moved[1], before[1], atol=1e-2)
+
+
+def test_without_covariance_one_content_serves_many_appearances():
+    transform = means_only()
+    features, reference = data()
+    content = transform.content_statistics(features[:1])
+    W, b = transform.affine(content, transform.style_statistics(reference))
+    assert (W.shape, b.shape) == ((2, 6, 6), (2, 6))
+    torch.testing.assert_close(b[1], transform.affine(content, transform.style_statistics(reference[1:]))[1][0])
+
+
+def test_the_moment_size_is_the_side_of_the_statistics(transform):
+    features, reference = data()
+    for module in (transform, means_only()):
+        side = module.moment_size
+        assert module.content_statistics(features).gram.shape == (2, side, side)
+        assert module.style_statistics(reference).gram.shape == (2, side, side)
+
+
 def released_pair(vectors: dict) -> tuple[ReleasedTransform, AffineDecoder]:
     transform, decoder = ReleasedTransform(), AffineDecoder()
     load_released(transform, under(vectors, "param/multi_net."), TRANSFORM)

@@ -66,7 +66,7 @@ def test_contraction_stays_in_the_unit_cube_and_can_be_undone(s):
 
 def test_a_point_at_infinity_has_features():
     field = make_field()
-    density, features = field.density_and_features(torch.tensor([[1e9, -1e9, 0.0]]))
+    density, features = field.density_and_inner(torch.tensor([[1e9, -1e9, 0.0]]))
     assert density.isfinite().all()
     assert features.isfinite().all()
 

@@ -6,11 +6,25 @@ import pytest
 import torch
 from torch import nn
 
+from model.appearance.code import ReleasedCode
 from model.appearance.crossray import AffineDecoder, ReleasedTransform
 from model.appearance.encoder import ReleasedEncoder
 from model.fields.mlp import RadianceMLP
-from model.released import CGNET, DECODER, ENCODER, NERF_MLP, TRANSFORM, load_released, under
+from model.released import (
+    CGNET,
+    CODE_NETWORK,
+    DECODER,
+    ENCODER,
+    NERF_MLP,
+    TRANSFORM,
+    TRANSIENT_HEAD,
+    UV_MASK,
+    load_released,
+    under,
+)
 from model.transient.cgnet import CGNet
+from model.transient.uncertainty import TransientHead
+from model.transient.uvmask import UVMask
 
 
 @pytest.mark.parametrize(
@@ -21,6 +35,9 @@ from model.transient.cgnet import CGNet
         (ReleasedTransform, TRANSFORM),
         (AffineDecoder, DECODER),
         (CGNet, CGNET),
+        (ReleasedCode, CODE_NETWORK),
+        (lambda: UVMask(photos=3).layers, UV_MASK),
+        (lambda: TransientHead(256, 3, rgb=True), TRANSIENT_HEAD),
     ],
 )
 def test_a_map_covers_its_module_and_loads(module, names):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_models import BOX, ROWS, small_batch, small_model, small_rays, small_spec
+from small_models import BOX, ROWS, TRANSFORMS, small_batch, small_model, small_rays, small_spec
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -15,8 +15,11 @@ from model.cameras import patch_grid
 from model.losses import LossWeights
 from model.scene_model import COMPACT_SIZE, RUNNING_MOMENTUM, Batch, SceneModel, as_images
 
-CROSS_RAY = [row for row in ROWS if row in ("crnerf-a", "crnerf") or row.startswith("crossray")]
-MASKED = ["crnerf-t", "crnerf", "crossray", "crossray-compact"]
+CROSS_RAY = [
+    *(row for row in ROWS if small_spec(row).appearance == "crossray" and small_spec(row).fused == "ray"),
+    *TRANSFORMS,
+]
+MASKED = ["crnerf-t", "crnerf", "crossray", "crossray-fast"]
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -25,7 +28,14 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 def appearance_of(model: SceneModel, photos: int = 1) -> Tensor | None:
     images = [torch.rand(3, 17, 22, generator=seeded(i)) for i in range(photos)]
+    if model.embedding is not None:
+        return model.embedding(torch.arange(photos))
     return None if model.encoder is None else model.encode(images)
+
+
+def code_of(model: SceneModel) -> Tensor | None:
+    """What its field reads of the first appearance."""
+    return appearance_of(model) if model.coded else None
 
 
 # --------------------------------------------------------------------------------------------------- rendering
@@ -35,19 +45,20 @@ def appearance_of(model: SceneModel, photos: int = 1) -> Tensor | None:
 def test_chunks_do_not_change_a_picture(row):
     model, rays = small_model(row), small_rays(6 * 9)
     with torch.no_grad():
-        embedding = appearance_of(model)
-        whole = model.render(rays, chunk=1000)
-        statistics = model.content_statistics(whole.features, (6, 9), "view")
+        embedding, code = appearance_of(model), code_of(model)
+        whole = model.render(rays, chunk=1000, code=code)
+        points = model.point_features(rays) if model.spec.fused == "point" and model.transform else None
+        statistics = model.content_statistics(whole.features, (6, 9), "view", points=points)
         picture = model.colours(whole.features[None], embedding, statistics)
         assert whole.features.std() > 1e-3
         assert picture.shape == (1, 54, 3)
         assert picture.min() >= 0
         assert picture.max() <= 1
         for chunk in (1, 7, 54):
-            parts = model.render(rays, chunk=chunk)
+            parts = model.render(rays, chunk=chunk, code=code)
             for name, a, b in zip(whole._fields, parts, whole, strict=True):
                 torch.testing.assert_close(a, b, atol=1e-5, rtol=0, msg=lambda m, name=name: f"{name}: {m}")
-            again = model.content_statistics(parts.features, (6, 9), "view")
+            again = model.content_statistics(parts.features, (6, 9), "view", points=points)
             colours = model.colours(parts.features[None], embedding, again)
             torch.testing.assert_close(colours, picture, atol=1e-5, rtol=0)
 
@@ -62,7 +73,7 @@ def test_rendering_shows_the_last_level_without_noise_or_jitter():
                 assert not a.requires_grad
 
 
-@pytest.mark.parametrize("row", ["crnerf", "crossray-compact"])
+@pytest.mark.parametrize("row", ["crnerf", "crossray-fast"])
 def test_bfloat16_changes_little_and_ends_in_float32(row):
     model, rays = small_model(row), small_rays(40)
     exact = model.render(rays)
@@ -105,7 +116,7 @@ def test_statistics_by_policy(row):
 def test_there_are_no_statistics_without_an_appearance(row):
     model = small_model(row)
     assert model.content_statistics(torch.rand(12, model.spec.channels), (3, 4), "view") is None
-    with pytest.raises(ValueError, match="no appearance"):
+    with pytest.raises(ValueError, match="reads nothing"):
         model.encode([torch.rand(3, 16, 16)])
 
 
@@ -151,25 +162,25 @@ def test_given_statistics_are_used():
 # --------------------------------------------------------------------------------------------- running averages
 
 
-@pytest.mark.parametrize("row", ["crnerf-a", "crossray-compact"])
+@pytest.mark.parametrize("row", ["crnerf-a", "crossray-fast"])
 def test_the_first_update_is_the_batch_and_the_second_the_mean_of_both(row):
     model = small_model(row)
     first, second = torch.rand(2, 3, 20, model.spec.channels, generator=seeded()).unbind(0)
     statistics = [model.transform.content_statistics(f) for f in (first, second)]
     means = [s.mean.mean(0, keepdim=True) for s in statistics]
     grams = [s.gram.mean(0, keepdim=True) for s in statistics]
-    model.track(first)
+    model.track(statistics[0])
     assert model.running_count == 1
     torch.testing.assert_close(model.running_mean, means[0])
     torch.testing.assert_close(model.running_gram, grams[0])
-    model.track(second)
+    model.track(statistics[1])
     assert model.running_count == 2
     torch.testing.assert_close(model.running_mean, (means[0] + means[1]) / 2)
     torch.testing.assert_close(model.running_gram, (grams[0] + grams[1]) / 2)
     assert not model.running_mean.requires_grad
     model.running_count.fill_(10_000)
     before = model.running_mean.clone()
-    model.track(first)
+    model.track(statistics[0])
     torch.testing.assert_close(model.running_mean, before + RUNNING_MOMENTUM * (means[0] - before))
 
 
@@ -177,7 +188,7 @@ def test_a_step_tracks_the_fine_features_once():
     model, batch = small_model("crnerf"), small_batch()
     model(batch, 0, seeded(), LossWeights())
     assert model.running_count == 1
-    fine = model.field.march(batch.rays, seeded()).levels[-1].composite().features.view(2, 64, 64)
+    fine = model.field.march(batch.rays, seeded()).levels[-1].composite().features.view(2, 256, 64)
     expected = fine.mean(dim=(0, 1))[None]
     torch.testing.assert_close(model.running_mean, expected.detach())
     assert {"running_mean", "running_gram", "running_count"} <= model.state_dict().keys()
@@ -206,7 +217,7 @@ def test_the_mask_lookup_is_resize_then_index(row):
                 seen = at_size([references[i]], COMPACT_SIZE)
             logit = F.interpolate(model.segmenter(seen), size=seen.shape[2:], mode="bilinear", align_corners=False)
             mask = F.interpolate(logit.sigmoid(), size=(h, w), mode="bilinear", align_corners=False)[0, 0]
-            torch.testing.assert_close(model.transient_mask(references[i], (h, w)), mask, atol=1e-5, rtol=0)
+            torch.testing.assert_close(model.transient_mask((h, w), references[i], None), mask, atol=1e-5, rtol=0)
             expected.append(mask[rows, cols])
         batch = small_batch()._replace(references=references, positions=torch.stack(positions))
         found = model.masks(batch)
@@ -256,7 +267,7 @@ def slow_terms(model: SceneModel, batch: Batch, step: int, weights: LossWeights)
         per_patch.setdefault(name, []).append(value)
 
     def image(rgb: Tensor) -> list[Tensor]:
-        return [rgb.mT.reshape(3, 8, 8)]
+        return [rgb.mT.reshape(3, 16, 16)]
 
     def content_features(rgb: Tensor) -> Tensor:
         (x,) = image(rgb)
@@ -365,14 +376,17 @@ def test_parameter_groups_cover_every_parameter_once(row):
         "grid": ("field.grid.table", "field.proposal_grid.table"),
         "field": ("field.", "decoder."),
         "appearance": ("encoder.", "content_encoder.", "transform."),
-        "transient": ("segmenter.",),
+        "embedding": ("embedding.weight", "transient_embedding.weight", "uvmask.embedding.weight"),
+        "transient": ("segmenter.", "uvmask."),
     }
     for group, parameters in groups.items():
         assert parameters, group
         assert all(names[id(p)].startswith(parts[group]) for p in parameters), group
-    assert ("grid" in groups) == (model.spec.field == "hash")
-    assert ("appearance" in groups) == (model.spec.appearance != "none")
-    assert ("transient" in groups) == (model.spec.transient != "none")
+    spec = model.spec
+    assert ("grid" in groups) == (spec.field == "hash")
+    assert ("appearance" in groups) == (spec.appearance in ("code", "crossray"))
+    assert ("embedding" in groups) == (spec.appearance == "embedding" or spec.transient in ("uncertainty", "uvmask"))
+    assert ("transient" in groups) == (spec.transient in ("segmenter", "uvmask"))
 
 
 def test_as_images_is_row_major():

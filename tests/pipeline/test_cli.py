@@ -141,8 +141,8 @@ def test_methods_lists_every_row(crossray, monkeypatch, columns):
     status, out, _ = crossray("methods")
     assert status == 0
     for name, method in METHODS.items():
-        (line,) = [line for line in out.splitlines() if re.match(rf"\W*{re.escape(name)} ", line)]
-        assert all(word in line for word in (method.field, method.appearance))
+        line, *_ = [line for line in out.splitlines() if re.match(rf"\W*{re.escape(name)} ", line)]
+        assert all(word in line for word in method.axes().values())
 
 
 # Shards

@@ -14,7 +14,8 @@ import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from model.methods import METHODS
+from model.losses import PRESETS, LossWeights
+from model.methods import AXES, METHODS
 from pipeline.config import RECIPES, Job, JobError, load_job, make_job, merge, parse_setting, save_job
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -324,9 +325,7 @@ def test_the_defaults_are_the_papers():
 @pytest.mark.parametrize("name", METHODS)
 def test_a_method_brings_its_axes(name):
     model = job({"method": name}).model
-    assert {axis: getattr(model, axis) for axis in ("field", "colour", "appearance", "transient")} == METHODS[
-        name
-    ].axes()
+    assert {axis: getattr(model, axis) for axis in AXES} == METHODS[name].axes()
 
 
 def test_the_hash_field_brings_its_recipe_to_any_method():
@@ -378,6 +377,48 @@ def test_shards_have_a_place_by_default():
     assert job({"scene": {"shards": "/y"}}).shards == Path("/y")
 
 
+def test_an_appearance_alone_is_fused_where_it_can_be():
+    for appearance, fused in (("embedding", "point"), ("code", "point"), ("none", "none"), ("crossray", "ray")):
+        assert job({"method": "crnerf", "model": {"appearance": appearance}}).model.fused == fused
+    assert job({"method": "crnerf-r"}).model.fused == "point"
+    assert job({"method": "crnerf-r", "model": {"appearance": "crossray"}}).model.fused == "point"  # as the row says
+    assert job({"method": "crnerf", "model": {"fused": "point"}}).model.fused == "point"
+
+
+def test_presets_bring_weights_and_single_keys_win():
+    assert job({"method": "crnerf"}).losses == LossWeights()
+    paper = job({"method": "crnerf", "losses": {"preset": "paper", "content": 0.5}}).losses
+    assert (paper.preset, paper.photometric, paper.appearance, paper.content) == ("paper", 1e-3, 1.0, 0.5)
+    assert job({"method": "crossray"}).losses == LossWeights(preset="fast", **PRESETS["fast"])
+    assert job({"method": "crossray", "losses": {"preset": "released"}}).losses == LossWeights()
+
+
+def test_masks_have_shards_of_their_own():
+    plain, masked = (job({"method": method}) for method in ("crnerf-a", "crnerf-a-masks"))
+    assert masked.shards.name == plain.shards.name + "-masks"
+    assert job({"method": "crnerf-a-masks", "scene": {"shards": "/s"}}).shards == Path("/s")
+
+
+@pytest.mark.parametrize("appearance", ["none", "embedding"])
+def test_colours_that_nothing_explains_are_not_changed(appearance):
+    over = {"method": "crossray", "model": {"appearance": appearance}}
+    assert job(over).train.colour_jitter == 0
+    with pytest.raises(JobError, match=rf"train\.colour_jitter: 0\.3 changes .*{appearance}"):
+        job(over | {"train": {"colour_jitter": 0.3}})
+
+
+def test_two_fields_are_compared_without_noise():
+    assert job({"method": "nerfw"}).model.mlp.density_noise == 0
+    assert job({"method": "hanerf"}).model.mlp.density_noise == 1
+
+
+def test_a_code_network_needs_larger_patches():
+    with pytest.raises(JobError, match=r"patch\.size: 12 is too small .* at least 16"):
+        job({"method": "hanerf", "patch": {"size": 12}})
+    job({"method": "hanerf", "patch": {"size": 16}})
+    job({"method": "hanerf", "patch": {"size": 12}, "losses": {"preset": "fast"}})
+
+
 # The resolved job
 
 
@@ -387,7 +428,8 @@ def test_shards_have_a_place_by_default():
         {},
         {"method": "crossray", "train": {"seconds": 3.5}},
         {"method": "nerf", "model": {"field": "hash"}},
-        {"method": "crossray", "model": {"appearance": "none"}, "train": {"colour_jitter": 0.3}},
+        {"method": "crossray", "model": {"appearance": "none"}, "losses": {"preset": "paper"}},
+        {"method": "hanerf", "losses": {"preset": "fast", "appearance": 0.25}},
         {"train": {"steps_per_epoch": 17, "adam_betas": [0.5, 0.75]}, "scene": {"shards": "/s"}},
         {"evaluate": {"protocols": ["crnerf-full@R2"]}},
     ],

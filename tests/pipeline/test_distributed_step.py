@@ -38,7 +38,8 @@ def test_every_method_takes_several_steps(cut, group, method, losses):
     """With the losses of its recipe, and without the appearance losses (as the fast field's recipe has it)."""
     job = tiny_job(cut, method, {"losses": losses})
     photos = tiny_photos(cut)
-    data = TrainingPhotos(photos, CONTEXT.device, job.model.pixel_center)
+    masks = job.model.transient == "fixed"
+    data = TrainingPhotos(photos, CONTEXT.device, job.model.pixel_center, masks)
     ddp = distribute(build_model(job, photos, CONTEXT.device), CONTEXT)
     work = Work(job, CONTEXT, data, steps_per_epoch=6)
     for step in range(3):

@@ -14,7 +14,7 @@ from tiny_run import cut_tiny, tiny_job
 from pipeline import evaluate as module
 from pipeline.checkpoint import CheckpointError
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import evaluate_run, fit_colours, load_run, parse_protocol, render_test_photo
+from pipeline.evaluate import Judge, evaluate_run, fit_colours, load_run, parse_protocol
 from pipeline.launch.run import claim_run
 from pipeline.metrics import ssim_11, ssim_window3
 from pipeline.photos import open_photos
@@ -82,12 +82,12 @@ def test_a_protocol_is_named_with_its_downscale(name, appearance, ssim, downscal
      "@R4", "crnerf-full@R4 ", "crnerf-full@R4\n", "CRNERF-FULL@R4", "../protocols/crnerf-full@R4"],
 )  # fmt: skip
 def test_a_bare_or_misspelt_name_says_how_to_write_it(name):
-    with pytest.raises(CrossrayError, match=r"crnerf-full@R4.*known: crnerf-full, nerfw-half"):
+    with pytest.raises(CrossrayError, match=r"crnerf-full@R4.*known: crnerf-full, cross, nerfw-half"):
         parse_protocol(name)
 
 
 def test_an_unknown_protocol_names_the_known_ones():
-    with pytest.raises(CrossrayError, match=r"'crnerf-ful' is not known \(known: crnerf-full, nerfw-half\)"):
+    with pytest.raises(CrossrayError, match=r"'crnerf-ful' is not known \(known: crnerf-full, cross, nerfw-half\)"):
         parse_protocol("crnerf-ful@R4")
 
 
@@ -207,7 +207,7 @@ def responsive(trained):
 
 
 def predict(model, photos, index, name):
-    return render_test_photo(model, photos, index, parse_protocol(name)[0])[1]
+    return Judge(model, photos, parse_protocol(name)[0], None).render(index)[1]
 
 
 def test_the_left_half_protocol_does_not_see_the_right_half(responsive, photos):

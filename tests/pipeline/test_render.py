@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from model.methods import METHODS, HashSpec, MLPSpec, ModelSpec
+from model.methods import CODE, METHODS, HashSpec, MLPSpec, ModelSpec
 from model.scene_model import SceneModel
-from pipeline.render import colour_view, read_appearance, render_view, view_rays
+from pipeline.render import colour_view, read_appearance, render_picture, render_view, view_rays
 from pipeline.shards import CameraRecord
 
 CPU = torch.device("cpu")
@@ -58,16 +58,19 @@ def test_rays_by_hand(stride, pixel_center):
 @pytest.mark.parametrize("row", METHODS)
 def test_a_view_has_its_shapes_and_no_chunks(row):
     model = small_model(row)
-    view = render_view(model, CAMERA)
+    code = torch.zeros(1, CODE) if model.coded else None
+    view = render_view(model, CAMERA, code)
     assert view.size == (7, 9)
-    assert view.features.shape == (63, 3 if row == "nerf" else 64)
+    channels = (3 if model.spec.colour == "head" else 64) + (row == "crnerf-r")  # there, the sum of weights is another
+    assert view.features.shape == (63, channels)
     assert view.depth.shape == view.accumulation.shape == (7, 9)
     assert view.accumulation.min() >= 0
     assert view.accumulation.max() <= 1 + 1e-5
     assert view.depth.max() <= 6 + 1e-4
-    in_parts = render_view(model, CAMERA, chunk=10)
-    for a, b in zip(in_parts[1:], view[1:], strict=True):
+    in_parts = render_view(model, CAMERA, code, chunk=10)
+    for a, b in zip(in_parts[1:4], view[1:4], strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
+    assert (view.points is not None) == (row == "crnerf-r")
     assert not view.features.requires_grad
 
 
@@ -111,7 +114,9 @@ def test_an_appearance_is_the_encoder_s_view_of_the_photo():
 @pytest.mark.parametrize("row", METHODS)
 def test_pictures_are_colours(row):
     model = small_model(row)
-    picture = colour_view(model, render_view(model, CAMERA), read_appearance(model, photo(0)))
+    appearance = read_appearance(model, photo(0)) if model.embedding is None else model.embedding.weight[:1].detach()
+    view, picture = render_picture(model, CAMERA, appearance)
+    assert view.size == (7, 9)
     assert picture.shape == (7, 9, 3)
     assert picture.dtype == np.float32
     assert picture.min() >= 0
@@ -132,7 +137,8 @@ def test_one_rendering_many_appearances():
 
 def test_policies_differ_where_statistics_do():
     model = small_model()
-    model.track(torch.rand(1, 50, 64, generator=torch.Generator().manual_seed(0)))
+    features = torch.rand(1, 50, 64, generator=torch.Generator().manual_seed(0))
+    model.track(model.transform.content_statistics(features))
     view, appearance = render_view(model, CAMERA), read_appearance(model, photo(0))
     content = {
         policy: model.content_statistics(view.features, view.size, policy) for policy in ("view", "patch", "running")
@@ -147,7 +153,8 @@ def test_policies_differ_where_statistics_do():
 def test_the_running_policy_does_not_look_at_the_view():
     """So that a film does not flicker: the colour of a ray does not depend on what else is in the picture."""
     model = small_model()
-    model.track(torch.rand(1, 50, 64, generator=torch.Generator().manual_seed(0)))
+    features = torch.rand(1, 50, 64, generator=torch.Generator().manual_seed(0))
+    model.track(model.transform.content_statistics(features))
     appearance = read_appearance(model, photo(0))
     full, part = render_view(model, CAMERA), render_view(model, CAMERA, stride=2)
     pictures = [colour_view(model, v, appearance, "running") for v in (full, part)]

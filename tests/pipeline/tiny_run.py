@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from tiny_scene import write_tiny_scene
 
+from model.methods import METHODS
 from pipeline import train as train_module
 from pipeline.checkpoint import latest_checkpoint
 from pipeline.config import Job, make_job, merge
@@ -59,6 +60,8 @@ def tiny_mapping(folder: Path, method: str = "crossray", over: dict[str, Any] | 
     }
     if method == "crossray":
         mapping["model"]["channels"] = 8
+    if METHODS[method].appearance == "code":  # its network reads no smaller picture
+        mapping["patch"]["size"] = 16
     return merge(mapping, over or {})
 
 
@@ -67,11 +70,16 @@ def tiny_job(folder: Path, method: str = "crossray", over: dict[str, Any] | None
 
 
 def cut_tiny(folder: Path, **scene: Any) -> Path:
-    """Write the tiny scene, tint it so that there is something to learn soon, and cut its shards, without Ray."""
+    """Write the tiny scene, tint it so that there is something to learn soon, mask a corner of each photo, and cut its
+    shards, without Ray."""
     write_tiny_scene(folder / "scene", splits=SPLITS, **scene)
+    (folder / "scene" / "masks").mkdir()
     for path in sorted((folder / "scene" / "dense" / "images").iterdir()):
         texture = np.asarray(Image.open(path))
         Image.fromarray((0.2 * texture + (190, 110, 10)).astype(np.uint8)).save(path)
+        mask = np.zeros(texture.shape[:2], np.uint8)
+        mask[: mask.shape[0] // 2, : mask.shape[1] // 2] = 255
+        Image.fromarray(mask).save(folder / "scene" / "masks" / f"{path.stem}.png")
     job = tiny_job(folder)
     cut_shards(
         job.scene.path,
