@@ -120,6 +120,7 @@ class Manifest(_Record):
     scene: SceneRecord
     downscale: int = Field(ge=1)
     reference_downscale: int = Field(ge=1)
+    masks: Sha256 | None = None  # of all masks together; None where the scene has none
     shards: tuple[ShardInfo, ...] = Field(min_length=1)
     patch_plan: PlanRecord
     libraries: dict[str, str]  # whose versions decide the bytes
@@ -222,6 +223,7 @@ def _cut(
         scene=summary,
         downscale=downscale,
         reference_downscale=reference_downscale,
+        masks=masks_hash(scene),
         shards=tuple(shards),
         patch_plan=plan_record(plan, scene, downscale),
         libraries=library_versions(),
@@ -329,6 +331,12 @@ def split_photos(photos: tuple[ScenePhoto, ...]) -> list[tuple[ScenePhoto, ...]]
 def mask_path(scene: Scene, photo: ScenePhoto) -> Path | None:
     path = (scene.root / "masks" / photo.name).with_suffix(".png")
     return path if path.is_file() else None
+
+
+def masks_hash(scene: Scene) -> str | None:
+    """SHA-256 of which photos have which masks; None where none has."""
+    found = {photo.key: path for photo in scene.photos if (path := mask_path(scene, photo))}
+    return digest({key: sha256_of(path) for key, path in found.items()}) if found else None
 
 
 def scene_record(scene: Scene) -> SceneRecord:

@@ -17,8 +17,8 @@ from pipeline.launch.local import run_local
 from pipeline.launch.tasks import ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
 from pipeline.progress import shown
-from pipeline.scene import read_scene
-from pipeline.shards import Manifest, cut_shards, read_manifest, scene_record
+from pipeline.scene import Scene, read_scene
+from pipeline.shards import Manifest, cut_shards, mask_path, masks_hash, read_manifest, scene_record
 
 log = logging.getLogger("crossray")
 
@@ -82,49 +82,85 @@ def flatten(mapping: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def check_scene(job: Job, manifest: Manifest) -> None:
-    """CrossrayError where the shards were cut from another scene than the one that the job names. Shards may travel
-    without their scene: where it is not at hand, or pycolmap is not, they are taken as they are."""
+def scene_at_hand(job: Job) -> Scene | None:
+    """The job's scene. Shards may travel without it: None where it is not there, or pycolmap is not."""
     if not job.scene.path.is_dir() or find_spec("pycolmap") is None:
-        log.info("%s is not at hand; training on the shards of %s", job.scene.path, manifest.scene.name)
-        return
-    if scene_record(read_scene(job.scene.path)).hash != manifest.scene.hash:
+        return None
+    return read_scene(job.scene.path)
+
+
+def check_scene(job: Job, scene: Scene, manifest: Manifest) -> None:
+    """CrossrayError where the shards were cut from another scene than the one that the job names."""
+    if scene_record(scene).hash != manifest.scene.hash:
         raise CrossrayError(
             f"scene.path: the shards in {job.shards} were cut from another scene, or from {job.scene.path} before it "
             "changed; --set scene.shards=FOLDER names other ones, or remove that folder"
         )
 
 
+def check_masks(job: Job, scene: Scene) -> None:
+    """CrossrayError where a training photo lacks the mask that the job reads."""
+    without = [p.name for p in scene.photos if p.split == "train" and mask_path(scene, p) is None]
+    if without:
+        more = f" and {len(without) - 1} more training photos" if len(without) > 1 else ""
+        raise CrossrayError(
+            f"model.transient: fixed, but {scene.root / 'masks'} holds no mask of {without[0]}{more}; "
+            f"`crossray mask {scene.root} --with ...` makes masks"
+        )
+
+
 def ensure_shards(job: Job) -> Manifest:
-    """The job's shards, cut by Ray tasks if they are not there; Ray is gone when this returns.
+    """The job's shards, cut by Ray tasks if they are not there, or if the masks that the job reads have changed; Ray is
+    gone when this returns.
 
     Raises:
-        CrossrayError: the scene is missing, or the shards that are there are of another size.
+        CrossrayError: the scene or its masks are missing, or the shards that are there are of another size.
     """
-    folder, scene = job.shards, job.scene
+    folder = job.shards
     folder.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(folder.parent / f".{folder.name}.lock"):
-        if not (folder / "manifest.json").is_file():
-            if not scene.path.is_dir():
+        scene, there = scene_at_hand(job), (folder / "manifest.json").is_file()
+        fixed = job.model.transient == "fixed"
+        if fixed and scene is not None:
+            check_masks(job, scene)
+        if not there:
+            if scene is None and not job.scene.path.is_dir():
                 raise CrossrayError(
-                    f"scene.path: {scene.path} is not a folder, and there are no shards in {folder}; "
+                    f"scene.path: {job.scene.path} is not a folder, and there are no shards in {folder}; "
                     "--set scene.path=FOLDER names the posed scene"
                 )
-            with ray_tasks() as mapper:
-                return cut_shards(
-                    scene.path,
-                    folder,
-                    downscale=scene.downscale,
-                    reference_downscale=scene.reference_downscale,
-                    plan=job.patch,
-                    mapper=shown(mapper, f"cutting shards of {scene.path.name}"),
-                )
-    manifest = read_manifest(folder)
-    check_scene(job, manifest)
+            return cut(job)
+        manifest = read_manifest(folder)
+        if scene is None:
+            log.info("%s is not at hand; training on the shards of %s", job.scene.path, manifest.scene.name)
+        else:
+            check_scene(job, scene, manifest)
+        check_sizes(job, manifest)
+        if fixed and scene is not None and masks_hash(scene) != manifest.masks:
+            log.info("the masks of %s have changed; its shards are cut again", job.scene.path)
+            return cut(job)
+        return manifest
+
+
+def cut(job: Job) -> Manifest:
+    """Cut the job's shards as Ray tasks."""
+    scene = job.scene
+    with ray_tasks() as mapper:
+        return cut_shards(
+            scene.path,
+            job.shards,
+            downscale=scene.downscale,
+            reference_downscale=scene.reference_downscale,
+            plan=job.patch,
+            mapper=shown(mapper, f"cutting shards of {scene.path.name}"),
+        )
+
+
+def check_sizes(job: Job, manifest: Manifest) -> None:
+    """CrossrayError where the shards were cut at other sizes than the job's."""
     for key in ("downscale", "reference_downscale"):
-        if getattr(manifest, key) != getattr(scene, key):
+        if getattr(manifest, key) != getattr(job.scene, key):
             raise CrossrayError(
-                f"scene.{key}: the job says {getattr(scene, key)}, but the shards in {folder} were cut with "
+                f"scene.{key}: the job says {getattr(job.scene, key)}, but the shards in {job.shards} were cut with "
                 f"{getattr(manifest, key)}; --set scene.shards=FOLDER names other ones"
             )
-    return manifest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -9,8 +10,10 @@ import shutil
 import time
 from contextlib import nullcontext
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny_run import assert_same_bits, cut_tiny, final_state, tiny_job, tiny_mapping, tiny_photos, train_until
 from tiny_scene import write_tiny_scene
@@ -24,6 +27,7 @@ from pipeline.launch import run as launch
 from pipeline.launch.run import claim_run, ensure_shards, run_job
 from pipeline.launch.tasks import in_process
 from pipeline.launch.torchrun import pick_device, run_rank
+from pipeline.photos import open_photos
 from pipeline.shards import cut_shards, verify_shards
 from pipeline.train import Context, TrainingError, checkpoints, train
 
@@ -458,6 +462,53 @@ def test_missing_shards_are_cut(make, monkeypatch, tmp_path):
     job = make("nerf", over={"scene": {"shards": str(tmp_path / "new" / "shards")}})
     ensure_shards(job)
     assert len(verify_shards(job.shards).keys) == 6
+
+
+@pytest.fixture
+def masked(make, cut, tmp_path, monkeypatch):
+    """A job with fixed masks on a copy of the scene whose masks may be changed, and how often its shards were cut."""
+    shutil.copytree(cut / "scene", tmp_path / "scene")
+    cuts: list[int] = []
+
+    def counted():
+        cuts.append(1)
+        return nullcontext(in_process)
+
+    monkeypatch.setattr(launch, "ray_tasks", counted)
+    over = {"scene": {"path": str(tmp_path / "scene"), "shards": str(tmp_path / "masked")}}
+    return make("crnerf-a-masks", over=over), cuts
+
+
+def test_changed_masks_are_cut_into_the_shards_again(masked):
+    job, cuts = masked
+    before = ensure_shards(job)
+    assert ensure_shards(job) == before
+    assert len(cuts) == 1
+    mask = np.array(Image.open(job.scene.path / "masks" / "photo_000.png"))
+    Image.fromarray(255 - mask).save(job.scene.path / "masks" / "photo_000.png")
+    after = ensure_shards(job)
+    assert len(cuts) == 2
+    assert after.content_hash != before.content_hash
+    np.testing.assert_array_equal(open_photos(job.shards).mask(0) > 127, (255 - mask)[::2, ::2] > 127)
+
+
+def test_a_missing_mask_is_named_before_anything_is_cut(masked):
+    job, cuts = masked
+    (job.scene.path / "masks" / "photo_001.png").unlink()
+    (job.scene.path / "masks" / "photo_003.png").unlink()  # of a test photo: not needed
+    with pytest.raises(CrossrayError, match=r"model\.transient: fixed.*no mask of photo_001\.jpg; `crossray mask"):
+        ensure_shards(job)
+    assert cuts == []
+
+
+def test_shards_without_masks_cannot_train_on_masks(masked, tmp_path):
+    job, _ = masked
+    shutil.rmtree(job.scene.path / "masks")
+    plain = job.model_copy(update={"model": dataclasses.replace(job.model, transient="none")})
+    ensure_shards(plain)
+    away = job.scene.model_copy(update={"path": tmp_path / "away"})  # the scene stays behind
+    with pytest.raises(CrossrayError, match=r"hold no mask of photo_000\.jpg and 3 more"):
+        train(job.model_copy(update={"scene": away}), Context())
 
 
 def test_a_whole_job_trains_and_evaluates(make, monkeypatch):
