@@ -24,7 +24,7 @@ from model.appearance.compact import CompactEncoder, CompactTransform, at_size
 from model.appearance.crossray import AffineDecoder, ContentStatistics, ReleasedTransform, recolour
 from model.appearance.encoder import ReleasedEncoder
 from model.cameras import patch_grid
-from model.fields.base import Codes, Field, Level, March, Rays, Rendering, at_least_float32
+from model.fields.base import Codes, Field, Level, March, Placed, Rays, Rendering, at_least_float32
 from model.fields.hash import HashField
 from model.fields.nerf import NeRFField
 from model.losses import (
@@ -455,11 +455,11 @@ class SceneModel(nn.Module):
             with self.autocast(rays.near.device):
                 yield self.field.march(part, samples=samples, codes=codes)
 
-    def picture(self, rays: Rays, code: Tensor, transient: Tensor | None) -> Tensor:
-        """rgb (R, 3) of a model with codes, with gradient to the codes (1, .): what a code is fitted with."""
-        codes = Codes(*(None if c is None else c.expand(len(rays.near), -1) for c in (code, None, transient)))
-        with self.autocast(rays.near.device):
-            march = self.field.march(rays, codes=codes)
+    def picture(self, placed: Placed, code: Tensor, transient: Tensor | None) -> Tensor:
+        """rgb (R, 3) at placed samples, with gradient to the codes (1, .): what a code is fitted with."""
+        codes = Codes(*(None if c is None else c.expand(len(placed.t), -1) for c in (code, None, transient)))
+        with self.autocast(placed.t.device):
+            march = self.field.look(placed, codes)
         level = march.levels[-1]
         features = level.composite().features if march.transient is None else march.transient.composite(level)
         return self.colours(at_least_float32(features)[None], None)[0]

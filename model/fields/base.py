@@ -1,11 +1,11 @@
-"""What every field gives back: samples along rays with weights, ready to be composited."""
+"""What a field is: it places samples along rays, and gives what is seen at them, weighted, ready to be composited."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from model.transient.uncertainty import Transient
 from model.volume import composite, joint_weights
@@ -97,12 +97,48 @@ class March(NamedTuple):
     transient: TransientSamples | None = None  # at the points of the last level
 
 
-class Field(Protocol):
+class Placed(NamedTuple):
+    """Rays with their samples placed: all of a field that no code changes."""
+
+    directions: Tensor  # (R, 3)
+    t: Tensor  # (R, S)
+    deltas: Tensor  # (R, S) lengths of the samples
+    density: Tensor  # (R, S)
+    weights: Tensor  # (R, S)
+    inner: Tensor  # (R, S, .) what the field knows of each point before it is seen in an appearance
+    before: list[Level]  # earlier levels
+    losses: dict[str, Tensor]
+
+    def of(self, rays: Tensor) -> Placed:
+        """Some of the rays, by their numbers, without earlier levels and losses."""
+        directions, t, deltas, density, weights, inner = (x[rays] for x in self[:6])
+        return Placed(directions, t, deltas, density, weights, inner, [], {})
+
+
+class Field(nn.Module):
     """(x, d) -> density, feature, along rays, with its own way of choosing samples."""
+
+    transient: nn.Module | None  # a TransientHead, or none
 
     def points_a_ray(self, samples: tuple[int, int] | None = None) -> int:
         """Points at which the field is evaluated for each ray, at most, in one pass of its networks."""
-        ...
+        raise NotImplementedError
+
+    def place(
+        self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
+    ) -> Placed:
+        """Choose samples along R rays and evaluate what no code changes; arguments as in `march`."""
+        raise NotImplementedError
+
+    def seen(self, inner: Tensor, directions: Tensor, code: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Features (R, S, C) at points, and (R, C) of the background where there is one, in the rays' appearance.
+
+        Args:
+            inner: (R, S, .) as `place` gives it.
+            directions: (R, 3).
+            code: (R, CODE), for a field that reads one.
+        """
+        raise NotImplementedError
 
     def march(
         self,
@@ -120,7 +156,19 @@ class Field(Protocol):
             codes: the appearance code where the field was made for one; the transient field and the other appearance
                 are evaluated where their codes are given.
         """
-        ...
+        return self.look(self.place(rays, generator, samples), codes)
+
+    def look(self, placed: Placed, codes: Codes) -> March:
+        """What is seen at placed samples: in the rays' appearance, in the other one, and of the transient field."""
+        directions, inner = placed.directions, placed.inner
+        level = Level(placed.t, placed.weights, *self.seen(inner, directions, codes.appearance))
+        other = transient = None
+        if codes.other is not None:  # released code of Ha-NeRF: only the colour layers learn from the other appearance
+            other = Level(placed.t, placed.weights, *self.seen(inner.detach(), directions, codes.other))
+        if codes.transient is not None and self.transient is not None:
+            head = self.transient(inner, codes.transient[:, None])
+            transient = transient_samples(head, placed.density, placed.deltas)
+        return March([*placed.before, level], placed.losses, other, transient)
 
 
 def append_one(x: Tensor) -> Tensor:
@@ -136,11 +184,6 @@ def at_least_float32(x: Tensor) -> Tensor:
 def points(rays: Rays, t: Tensor) -> Tensor:
     """Points (R, S, 3) at distances t (R, S)."""
     return rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-
-
-def at_points(code: Tensor | None) -> Tensor | None:
-    """Codes (R, n) of rays as (R, 1, n), for all points of each."""
-    return None if code is None else code[:, None]
 
 
 def transient_samples(head: Transient, static_density: Tensor, deltas: Tensor) -> TransientSamples:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from model.encoding import positional_encoding
-from model.fields.base import Codes, Level, March, Rays, at_least_float32, at_points, points, transient_samples
+from model.fields.base import Field, Placed, Rays, at_least_float32, points
 from model.fields.hashgrid import HashEncoding
 from model.methods import CODE, HashSpec
 from model.sampling import sample_pdf
@@ -31,7 +31,7 @@ TRANSIENT_DEPTH = 2  # layers of the transient head
 TRANSIENT_BIAS = -3.0  # the transient field starts almost empty: softplus(-3) is 0.05 a scene unit
 
 
-class HashField(nn.Module):
+class HashField(Field):
     """Hash-grid density and features with proposal sampling (Zip-NeRF's and Instant-NGP's parts, small).
 
     Args:
@@ -67,13 +67,9 @@ class HashField(nn.Module):
         """See Field."""
         return max(samples or (self.spec.proposal_samples, self.spec.samples))
 
-    def march(
-        self,
-        rays: Rays,
-        generator: torch.Generator | None = None,
-        samples: tuple[int, int] | None = None,
-        codes: Codes = Codes(),
-    ) -> March:
+    def place(
+        self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
+    ) -> Placed:
         """See Field. The loss `interlevel` keeps the proposal's weights an upper bound of the field's."""
         num_proposal, num_samples = samples or (self.spec.proposal_samples, self.spec.samples)
         edges = uniform_edges(rays.near, rays.far, num_proposal, generator)
@@ -81,25 +77,16 @@ class HashField(nn.Module):
         proposal_weights = render_weights(self.proposal_density(points(rays, middle)), width)
 
         fine_edges = self.resample(edges, proposal_weights.detach(), num_samples, generator)
-        t, delta = 0.5 * (fine_edges[:, 1:] + fine_edges[:, :-1]), fine_edges.diff(dim=-1)
+        t, deltas = 0.5 * (fine_edges[:, 1:] + fine_edges[:, :-1]), fine_edges.diff(dim=-1)
         density, inner = self.density_and_inner(points(rays, t))
-        weights = render_weights(density, delta)
-        level = Level(t, weights, *self.seen(inner, rays.directions, codes.appearance))
+        weights = render_weights(density, deltas)
         losses = {}
         if generator is not None:
             losses["interlevel"] = interlevel_loss(fine_edges, weights.detach(), edges, proposal_weights)
-        other = transient = None
-        if codes.other is not None:  # as in the faithful field, only the colour layers learn from the other appearance
-            other = Level(t, weights, *self.seen(inner.detach(), rays.directions, codes.other))
-        if codes.transient is not None and self.transient is not None:
-            transient = transient_samples(self.transient(inner, at_points(codes.transient)), density, delta)
-        return March([level], losses, other, transient)
+        return Placed(rays.directions, t, deltas, density, weights, inner, [], losses)
 
     def seen(self, inner: Tensor, directions: Tensor, code: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Features (R, S, C) of points and (R, C) of the background in the rays' appearance.
-
-        inner: (R, S, .), what the trunk knows of each point. code: (R, CODE) where the field reads one.
-        """
+        """See Field."""
         looked = positional_encoding(directions, DIRECTION_FREQUENCIES)
         if self.coloured is not None:
             if code is None:

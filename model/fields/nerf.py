@@ -6,19 +6,9 @@ Codes enter the fine MLP only: the coarse one is unconditioned in the released c
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from model.fields.base import (
-    Codes,
-    Level,
-    March,
-    Rays,
-    TransientSamples,
-    at_least_float32,
-    at_points,
-    points,
-    transient_samples,
-)
+from model.fields.base import Field, Level, Placed, Rays, at_least_float32, points
 from model.fields.mlp import RadianceMLP
 from model.methods import CODE, MLPSpec
 from model.sampling import refine, stratified
@@ -26,7 +16,7 @@ from model.transient.uncertainty import TransientHead
 from model.volume import intervals, render_weights
 
 
-class NeRFField(nn.Module):
+class NeRFField(Field):
     """Hierarchical sampling over a coarse and a fine RadianceMLP; both are levels that carry a loss.
 
     Args:
@@ -52,24 +42,22 @@ class NeRFField(nn.Module):
         """See Field: the fine MLP sees both kinds of samples."""
         return sum(samples or (self.spec.coarse_samples, self.spec.fine_samples))
 
-    def march(
-        self,
-        rays: Rays,
-        generator: torch.Generator | None = None,
-        samples: tuple[int, int] | None = None,
-        codes: Codes = Codes(),
-    ) -> March:
+    def place(
+        self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
+    ) -> Placed:
         """See Field. The fine level sees the coarse samples too, in one sorted list."""
         num_coarse, num_fine = samples or (self.spec.coarse_samples, self.spec.fine_samples)
-        shape = (len(rays.near), num_coarse)
-        device = rays.near.device
-        jitter = None if generator is None else torch.rand(shape, device=device, generator=generator)
+        count, device = len(rays.near), rays.near.device
+        jitter = None if generator is None else torch.rand(count, num_coarse, device=device, generator=generator)
         t = stratified(rays.near, rays.far, num_coarse, jitter)
         coarse = self.coarse_level(rays, t, generator)
 
-        u = None if generator is None else torch.rand(shape[0], num_fine, device=device, generator=generator)
-        fine, other, transient = self.fine_level(rays, refine(t, coarse.weights, num_fine, u), generator, codes)
-        return March([coarse, fine], {}, other, transient)
+        u = None if generator is None else torch.rand(count, num_fine, device=device, generator=generator)
+        t = refine(t, coarse.weights, num_fine, u)
+        h = self.fine.trunk(points(rays, t))
+        density, deltas = self.noisy(self.fine.density_at(h), generator), intervals(t)
+        weights = render_weights(density, deltas)
+        return Placed(rays.directions, t, deltas, density, weights, self.fine.bottleneck(h), [coarse], {})
 
     def coarse_level(self, rays: Rays, t: Tensor, generator: torch.Generator | None) -> Level:
         """The coarse MLP at distances t (R, S)."""
@@ -77,22 +65,10 @@ class NeRFField(nn.Module):
         weights = render_weights(self.noisy(density, generator), intervals(t))
         return Level(t, weights, at_least_float32(features))
 
-    def fine_level(
-        self, rays: Rays, t: Tensor, generator: torch.Generator | None, codes: Codes
-    ) -> tuple[Level, Level | None, TransientSamples | None]:
-        """The fine MLP at distances t (R, S): in the rays' appearance, in the other one, and its transient field."""
-        h = self.fine.trunk(points(rays, t))
-        bottleneck, directions, deltas = self.fine.bottleneck(h), rays.directions[:, None], intervals(t)
-        density = self.noisy(self.fine.density_at(h), generator)
-        features = self.fine.features_at(bottleneck, directions, at_points(codes.appearance))
-        fine = Level(t, render_weights(density, deltas), at_least_float32(features))
-        other = transient = None
-        if codes.other is not None:  # released code of Ha-NeRF: only the colour layers learn from the other appearance
-            seen = self.fine.features_at(bottleneck.detach(), directions, at_points(codes.other))
-            other = fine._replace(features=at_least_float32(seen))
-        if codes.transient is not None and self.transient is not None:
-            transient = transient_samples(self.transient(bottleneck, at_points(codes.transient)), density, deltas)
-        return fine, other, transient
+    def seen(self, inner: Tensor, directions: Tensor, code: Tensor | None) -> tuple[Tensor, None]:
+        """See Field. There is no background: light that meets nothing is lost."""
+        code = None if code is None else code[:, None]
+        return at_least_float32(self.fine.features_at(inner, directions[:, None], code)), None
 
     def noisy(self, density: Tensor, generator: torch.Generator | None) -> Tensor:
         """Densities, in training with noise."""
