@@ -1,9 +1,9 @@
 """Fitting an appearance code to a photo that the model has not seen: how NeRF-W is judged, and any model whose photos
 have learned codes.
 
-Nothing but the codes moves, so samples are placed once, for a pool of rays that the steps draw from. Codes start from the
-mean over the training photos; the photo's transient code is fitted beside its appearance, so that people in the photo do
-not tint it, and is dropped afterwards.
+Nothing but the codes moves, so samples are placed once, for a pool of rays that the steps draw from. Codes start from
+the mean over the training photos; the photo's transient code is fitted beside its appearance, so that people in the
+photo do not tint it, and is dropped afterwards.
 """
 
 from __future__ import annotations
