@@ -150,7 +150,7 @@ METHODS: dict[str, Method] = {
     ),
     "crnerf-a-masks": Method(
         "mlp", "decoder", "crossray", "ray", "fixed", "CR-NeRF-A + DeepLabV3 or Mask R-CNN: mask table",
-        "which classes count as transient (pipeline/masks.py)",
+        "which classes count as transient (pipeline/segmentation/classes.py)",
     ),
     "crnerf-r": Method("mlp", "decoder", "crossray", "point", "segmenter", "CR-NeRF-R: table 1", POINTS),
     "crnerf": Method("mlp", "decoder", "crossray", "ray", "segmenter", "CR-NeRF: table 1"),

@@ -329,8 +329,9 @@ def split_photos(photos: tuple[ScenePhoto, ...]) -> list[tuple[ScenePhoto, ...]]
 
 
 def mask_path(scene: Scene, photo: ScenePhoto) -> Path | None:
+    """The mask of a photo, None where there is none; a photo's name cannot lead out of the folder of masks."""
     path = (scene.root / "masks" / photo.name).with_suffix(".png")
-    return path if path.is_file() else None
+    return path if ".." not in path.relative_to(scene.root).parts and path.is_file() else None
 
 
 def masks_hash(scene: Scene) -> str | None:

@@ -19,7 +19,18 @@ from pipeline import cli
 from pipeline.config import Job
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMANDS = ("quickstart", "run", "shard", "verify", "evaluate", "methods", "schema")
+COMMANDS = (
+    "quickstart",
+    "landmark",
+    "mask",
+    "shard",
+    "verify",
+    "run",
+    "evaluate",
+    "import-checkpoint",
+    "methods",
+    "schema",
+)
 
 
 @pytest.fixture
