@@ -1,6 +1,7 @@
 """Masks made elsewhere: a folder of grayscale PNGs, 255 = certainly transient, a photo's full size or any other.
 
-The mask of `castle/a.jpg` is `castle/a.png` or `castle/a.jpg.png` in the folder.
+The mask of `castle/a.jpg` is `castle/a.png`, `castle/a.jpg.png` or `castle/a.mask.png` in the folder. The last is how
+the built-in landmark keeps its true masks: `folder:LANDMARK/truth` gives what a perfect segmenter would.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ class MaskFolder(Segmenter):
 
     def candidates(self, photo: ScenePhoto) -> list[Path]:
         name = Path(photo.name)
-        paths = (self.folder / name.with_suffix(".png"), self.folder / f"{name}.png")
+        ends = (name.with_suffix(".png"), f"{name}.png", name.with_suffix(".mask.png"))
+        paths = [self.folder / end for end in ends]
         return [path for path in dict.fromkeys(paths) if path.is_file()]
 
     def problem(self, photo: ScenePhoto) -> str | None:

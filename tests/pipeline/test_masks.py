@@ -433,7 +433,7 @@ def elsewhere(root, tmp_path):
     for i in range(PHOTOS):
         size = SIZE if i % 2 else (24, 18)
         mask = Image.fromarray(rng.integers(0, 256, size[::-1], dtype=np.uint8))
-        mask.save(folder / (f"photo_{i:03d}.png" if i < 5 else f"photo_{i:03d}.jpg.png"))
+        mask.save(folder / f"photo_{i:03d}{'.mask.png' if i == 4 else '.png' if i < 4 else '.jpg.png'}")
     return folder
 
 
@@ -481,7 +481,7 @@ def test_every_mask_that_does_not_fit_is_listed_at_once(root, elsewhere):
         "photo_001.jpg is 48 x 36 and photo_001.png 48 x 48",
         "photo_002.jpg: photo_002.png is RGB, not grayscale",
         "photo_003.jpg: photo_003.png is not a PNG picture",
-        "photo_004.jpg: photo_004.png and photo_004.jpg.png: keep one",
+        "photo_004.jpg: photo_004.jpg.png and photo_004.mask.png: keep one",
         "and 1 more",
     ]
     assert not (root / "masks").exists()
@@ -509,8 +509,8 @@ def test_a_cut_off_mask_of_a_folder_is_named(root, elsewhere):
 
 def test_the_scenes_own_masks_are_not_copied_onto_themselves(root, elsewhere):
     elsewhere.rename(root / "masks")
-    for path in (root / "masks").glob("*.jpg.png"):
-        path.rename(path.with_name(path.name.replace(".jpg.png", ".png")))
+    for path in (root / "masks").glob("*.*.png"):
+        path.rename(path.with_name(path.name.split(".")[0] + ".png"))
     before = contents(root / "masks")
     segmenter = find_segmenter(f"folder:{root / 'masks'}")
     with pytest.raises(MaskError, match="there may be nothing to do"):
