@@ -33,6 +33,7 @@ def random_batch(patches: int, size: int, device: torch.device) -> Batch:
         Rays(*(r.to(device) for r in rays)),
         torch.rand(patches, size * size, 3, device=device),
         torch.rand(patches, size * size, 2, device=device),
+        torch.arange(patches, device=device),
         photos,
         photos,
     )
@@ -42,7 +43,7 @@ def seconds_a_step(method: str, bfloat16: bool, repeats: int, device: torch.devi
     """Forward and backward, `repeats` times after one that does not count."""
     job = make_job({"name": "benchmark", "method": method, "scene": {"path": "."}})
     torch.manual_seed(0)
-    model = SceneModel(job.model, torch.tensor([[-1.0] * 3, [1.0] * 3])).to(device)
+    model = SceneModel(job.model, torch.tensor([[-1.0] * 3, [1.0] * 3]), job.patch.photos).to(device)
     model.use_bfloat16 = bfloat16
     batch = random_batch(job.patch.photos, job.patch.size, device)
     times = []

@@ -89,6 +89,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "appearance_target": "own",
         "content": 1e-5,
         "embedding": 0.0,
+        "transient_density": 0.01 * LAMBDA / 0.5,  # as NeRF-W weighs it against the pixels
     },
     "fast": {
         "mask_start": 0.3,

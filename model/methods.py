@@ -16,6 +16,7 @@ from typing import Literal
 CODE = 48  # numbers in a photo's appearance code (NeRF-W's l_a; Ha-NeRF's)
 TRANSIENT_CODE = 16  # numbers in a photo's transient code (NeRF-W's l_tau)
 VIEW_CODE = 128  # numbers in a photo's code for its uv mask (Ha-NeRF)
+SMALLEST_SIDE = {"crossray": 8, "code": 16}  # pixels: released networks of this appearance read no smaller picture
 
 STRICT = {
     "extra": "forbid",
@@ -201,6 +202,11 @@ def check_spec(spec: ModelSpec) -> None:
             f"model.channels: the released encoder gives 64 channels, not {spec.channels}; "
             "set model.channels to 64 or model.encoder to compact"
         )
+
+
+def smallest_side(spec: ModelSpec) -> int:
+    """Pixels of the shorter side of the smallest picture whose appearance the model can read."""
+    return SMALLEST_SIDE.get(spec.appearance, 1) if spec.encoder == "released" else 1
 
 
 def check_fusion(spec: ModelSpec) -> None:

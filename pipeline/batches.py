@@ -96,6 +96,18 @@ def check_masks(photos: Photos, indices: tuple[int, ...]) -> None:
         )
 
 
+def check_references(photos: Photos, least: int) -> None:
+    """CrossrayError for a reference with a side under `least` pixels, which the appearance network cannot read."""
+    for i, record in enumerate(photos.records):
+        height, width = photos.reference(i).shape[:2]
+        if min(height, width) < least:
+            factor = photos.manifest.reference_downscale
+            raise CrossrayError(
+                f"scene.reference_downscale: {factor} makes {record.name} {width} x {height} pixels, and "
+                f"model.encoder: released reads no side under {least}; a smaller factor, or model.encoder: compact"
+            )
+
+
 def as_tensor(image: np.ndarray, device: torch.device) -> Tensor:
     """A uint8 picture (h, w, 3) as (3, h, w) in [0, 1]."""
     return torch.from_numpy(np.array(image)).to(device).permute(2, 0, 1).float() / 255

@@ -16,7 +16,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.losses import PRESETS, LossWeights, check_weights
-from model.methods import FUSED_AT, METHODS, ModelSpec, check_spec
+from model.methods import FUSED_AT, METHODS, ModelSpec, check_spec, smallest_side
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.patches import PatchPlan
@@ -183,6 +183,13 @@ RECIPES: dict[str, dict[str, Any]] = {
 }
 
 
+# With the schedule of the segmenter, uv masks of the fast field fell to 0 early and stayed there.
+UVMASK: dict[str, Any] = {
+    "losses": {"mask_start": 0.05, "mask_end": 0.01, "mask_decay": 0.003},
+    "train": {"learning_rates": {"embedding": 0.005}},
+}
+
+
 def load_job(path: Path, settings: Sequence[str] = ()) -> Job:
     """The job in a YAML file, with `key.sub=value` settings on top.
 
@@ -219,7 +226,7 @@ def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "j
 def check_patch(job: Job) -> None:
     """Refuse patches that the appearance losses cannot encode, and colours that nothing could explain."""
     model, losses = job.model, job.losses
-    least = {"crossray": 8, "code": 16}.get(model.appearance, 0) if model.encoder == "released" else 0
+    least = smallest_side(model)
     if job.patch.size < least and (losses.appearance > 0 or losses.content > 0):
         raise ValueError(
             f"patch.size: {job.patch.size} is too small for the appearance losses with model.appearance: "
@@ -248,10 +255,12 @@ def with_defaults(raw: dict[str, Any]) -> dict[str, Any]:
         axes["fused"] = FUSED_AT.get(chosen["appearance"], "none")
     axes |= chosen
     recipe = merge(recipe_of(axes), {"model": axes})
-    preset = as_dict(raw.get("losses")).get("preset", recipe.get("losses", {}).get("preset"))
-    if isinstance(preset, str):
-        recipe = merge(recipe, {"losses": {"preset": preset, **PRESETS.get(preset, {})}})
-    return merge(recipe, raw)
+    preset = as_dict(raw.get("losses")).get("preset")
+    if preset is None:
+        preset = recipe.get("losses", {}).get("preset", "released")
+        return merge(merge({"losses": PRESETS[preset]}, recipe), raw)
+    known = PRESETS.get(preset, {}) if isinstance(preset, str) else {}
+    return merge(merge({**recipe, "losses": known}, {"losses": {"preset": preset}}), raw)
 
 
 def recipe_of(axes: dict[str, str]) -> dict[str, Any]:
@@ -261,6 +270,8 @@ def recipe_of(axes: dict[str, str]) -> dict[str, Any]:
         recipe = merge(recipe, {"train": {"colour_jitter": 0.0}})
     if axes["transient"] == "uncertainty":  # as NeRF-W's code: two fields whose densities are compared, without noise
         recipe = merge(recipe, {"model": {"mlp": {"density_noise": 0.0}}})
+    if axes["field"] == "hash" and axes["transient"] == "uvmask":
+        recipe = merge(recipe, UVMASK)
     return recipe
 
 

@@ -66,7 +66,7 @@ class Protocol(BaseModel):
     rounding: Literal["truncate", "round"]
     ssim: Literal["window3", "window11"]
     mlp_samples: tuple[int, int]
-    fit: FitRecipe
+    fit: dict[Literal["mlp", "hash"], FitRecipe]
 
 
 def parse_protocol(name: str) -> tuple[Protocol, int, bool]:
@@ -223,8 +223,13 @@ class Judge:
         if key not in self.codes:
             columns = left_half(image).shape[1] if self.appearance_from == "left" else image.shape[1]
             camera = self.photos.records[source]
-            self.codes[key] = fit_code(self.model, image, camera, columns, self.protocol.fit, seed=index)
+            self.codes[key] = fit_code(self.model, image, camera, columns, self.recipe, seed=index)
         return self.codes[key]
+
+    @property
+    def recipe(self) -> FitRecipe:
+        """How codes are fitted."""
+        return self.protocol.fit[self.model.spec.field]
 
     def clean(self, view: int, light: int) -> np.ndarray:
         """The landmark in the view of one photo and the light of another, nobody there."""

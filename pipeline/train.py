@@ -23,8 +23,9 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
+from model.methods import smallest_side
 from model.scene_model import Batch, SceneModel, needs_other
-from pipeline.batches import TrainingPhotos, jitter_colours
+from pipeline.batches import TrainingPhotos, check_references, jitter_colours
 from pipeline.board import psnr_of, write_pictures, write_scalars
 from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
 from pipeline.config import BOOKKEEPING, Job, TrainJob
@@ -132,6 +133,7 @@ def train(job: Job, context: Context) -> dict[str, Any]:
     """
     torch.set_num_threads(job.threads)
     photos = open_photos(job.shards)
+    check_references(photos, smallest_side(job.model))
     data = TrainingPhotos(photos, context.device, job.model.pixel_center, masks=job.model.transient == "fixed")
     work = Work(job, context, data, epoch_length(job, data.sizes, context.world_size))
     model = build_model(job, photos, context.device)

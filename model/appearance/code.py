@@ -9,9 +9,9 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from model.appearance.compact import strided_convolutions
-from model.methods import CODE
+from model.methods import CODE, SMALLEST_SIDE
 
-SMALLEST_SIDE = 16  # three halvings leave 2 pixels, which reflection padding needs
+LEAST = SMALLEST_SIDE["code"]  # three halvings of 16 leave 2 pixels, which reflection padding needs
 
 
 class ReleasedCode(nn.Module):
@@ -31,10 +31,8 @@ class ReleasedCode(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """RGB in [0, 1] (B, 3, h, w), h and w at least 16 -> codes (B, CODE). ValueError otherwise."""
-        if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[2:]) < SMALLEST_SIDE:
-            raise ValueError(
-                f"the code network reads (B, 3, h, w) with h, w >= {SMALLEST_SIDE}, not {tuple(image.shape)}"
-            )
+        if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[2:]) < LEAST:
+            raise ValueError(f"the code network reads (B, 3, h, w) with h, w >= {LEAST}, not {tuple(image.shape)}")
         return self.head(self.layers(2 * image - 1).mean(dim=(2, 3)))
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-SMALLEST_SIDE = 8  # two poolings leave 2 pixels, which reflection padding needs
+from model.methods import SMALLEST_SIDE
+
+LEAST = SMALLEST_SIDE["crossray"]  # two poolings of 8 leave 2 pixels, which reflection padding needs
 
 
 class ReleasedEncoder(nn.Module):
@@ -35,8 +37,8 @@ class ReleasedEncoder(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """RGB in [0, 1] (B, 3, h, w), h and w at least 8 -> F^a (B, 64, 32, 32). ValueError otherwise."""
-        if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[2:]) < SMALLEST_SIDE:
-            raise ValueError(f"the encoder reads (B, 3, h, w) with h, w >= {SMALLEST_SIDE}, not {tuple(image.shape)}")
+        if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[2:]) < LEAST:
+            raise ValueError(f"the encoder reads (B, 3, h, w) with h, w >= {LEAST}, not {tuple(image.shape)}")
         return self.layers(image)
 
 

@@ -163,7 +163,9 @@ class Field(nn.Module):
         directions, inner = placed.directions, placed.inner
         level = Level(placed.t, placed.weights, *self.seen(inner, directions, codes.appearance))
         other = transient = None
-        if codes.other is not None:  # released code of Ha-NeRF: only the colour layers learn from the other appearance
+        if (
+            codes.other is not None
+        ):  # released code of Ha-NeRF: colours and weights learn from it, the trunk's features not
             other = Level(placed.t, placed.weights, *self.seen(inner.detach(), directions, codes.other))
         if codes.transient is not None and self.transient is not None:
             head = self.transient(inner, codes.transient[:, None])

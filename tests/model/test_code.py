@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.appearance.code import SMALLEST_SIDE, CompactCode, ReleasedCode
+from model.appearance.code import LEAST, CompactCode, ReleasedCode
 from model.appearance.compact import CompactEncoder
 from model.fields.mlp import RadianceMLP
 from model.losses import (
@@ -47,7 +47,7 @@ def test_a_code_for_each_photo_and_each_photo_alone(network):
 
 def test_photos_of_any_size_down_to_the_smallest(network):
     with torch.no_grad():
-        for size in ((SMALLEST_SIDE, SMALLEST_SIDE), (SMALLEST_SIDE, 37), (33, 24)):
+        for size in ((LEAST, LEAST), (LEAST, 37), (33, 24)):
             assert network(photos(1, size)).shape == (1, CODE)
 
 
