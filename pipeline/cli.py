@@ -95,7 +95,13 @@ def run(
     """Run a job file: shards if they are absent, training, evaluation. Again: goes on from where it was."""
     from pipeline.config import load_job
     from pipeline.launch.run import run_job
+    from pipeline.study import read_kind
 
+    if read_kind(job) == "study":
+        if launcher:
+            raise CrossrayError(f"--launcher: {job} is a study, which starts its runs itself; leave it out")
+        run_study_file(job, settings)
+        return
     extra = [f"launcher={launcher}"] if launcher else []
     resolved = load_job(job, [*settings, *extra])
     trained, evaluated = run_job(resolved)
@@ -106,6 +112,25 @@ def run(
     for result in evaluated:
         print_scores(result)
     print_line(f"TensorBoard: tensorboard --logdir {resolved.runs}")
+
+
+def run_study_file(file: Path, settings: list[str]) -> None:
+    """Run a study and print its tables; exit status 1 if some of its runs are not done."""
+    from pipeline.launch.study import run_study
+    from pipeline.study import as_rich, captions, load_study
+
+    study = load_study(file, settings)
+    tables, failures = run_study(study)
+    console = Console() if sys.stdout.isatty() else Console(width=1000)  # nothing is wrapped in a file
+    for table in tables:
+        console.print(as_rich(table))
+    for text in captions(study):
+        print_line(text)
+    print_line(f"{study.folder / 'table.md'}, {study.folder / 'study.json'}")
+    for name, reason in failures.items():
+        print_line(f"not done: {name}: {reason}")
+    if failures:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -205,10 +230,11 @@ def evaluate(
     step: Annotated[int | None, typer.Option(help="Checkpoint to evaluate; the newest by default.")] = None,
 ) -> None:
     """Score a run on its test photos under a protocol; metrics.json and pictures go to RUN/eval."""
-    from pipeline.evaluate import evaluate_run
+    from pipeline.evaluate import Codes, evaluate_run
 
+    codes: Codes = {}
     for name in protocol:
-        print_scores(evaluate_run(run, name, step))
+        print_scores(evaluate_run(run, name, step, codes))
 
 
 @app.command("import-checkpoint")

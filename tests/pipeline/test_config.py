@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from model.losses import PRESETS, LossWeights
 from model.methods import AXES, METHODS
 from pipeline.config import RECIPES, Job, JobError, load_job, make_job, merge, parse_setting, save_job
+from pipeline.study import read_kind
 
 ROOT = Path(__file__).resolve().parents[2]
 SHEBANG = "#!/usr/bin/env -S python -m pipeline run"
@@ -393,6 +394,16 @@ def test_presets_bring_weights_and_single_keys_win():
     assert job({"method": "crossray", "losses": {"preset": "released"}}).losses == LossWeights()
 
 
+def test_uv_masks_on_the_fast_field_are_trained_more_gently():
+    recipe = job({"method": "hanerf", "model": {"field": "hash"}})
+    assert (recipe.losses.mask_start, recipe.losses.preset) == (0.05, "fast")
+    assert recipe.train.learning_rates.embedding == 0.005
+    assert recipe.train.learning_rates.grid == 0.02  # the rest of the field's recipe stays
+    asked = job({"method": "hanerf", "model": {"field": "hash"}, "losses": {"preset": "fast"}})
+    assert asked.losses == LossWeights(preset="fast", **PRESETS["fast"])  # a preset that is asked for is taken whole
+    assert job({"method": "hanerf"}).losses == LossWeights()
+
+
 def test_masks_have_shards_of_their_own():
     plain, masked = (job({"method": method}) for method in ("crnerf-a", "crnerf-a-masks"))
     assert masked.shards.name == plain.shards.name + "-masks"
@@ -487,13 +498,14 @@ def test_only_job_errors_come_out_of_settings(key, value):
 # The job files of the repository
 
 JOBS = sorted((ROOT / "jobs").glob("*.yaml"))
+TRAIN_JOBS = [path for path in JOBS if read_kind(path) == "train"]
 
 
 class TestJobFiles:
     def test_there_are_some(self):
         assert {"train_scene.yaml", "train_scene_cpu.yaml"} <= {path.name for path in JOBS}
 
-    @pytest.mark.parametrize("path", JOBS, ids=lambda p: p.name)
+    @pytest.mark.parametrize("path", TRAIN_JOBS, ids=lambda p: p.name)
     def test_it_loads(self, path):
         found = load_job(path)
         assert found.evaluate.protocols
@@ -509,7 +521,7 @@ class TestJobFiles:
         ).stdout
         assert not listed or listed.startswith("100755 "), "git keeps it without its executable bit"
 
-    @pytest.mark.parametrize("path", JOBS, ids=lambda p: p.name)
+    @pytest.mark.parametrize("path", TRAIN_JOBS, ids=lambda p: p.name)
     def test_the_shared_keys_are_said_where_they_can_be_set(self, path):
         assert load_job(path, ["scene.path=data/other", "name=other"]).scene.path == Path("data/other")
 

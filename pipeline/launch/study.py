@@ -1,0 +1,176 @@
+"""Runs a study: shards first, then every run that is not done as a process of its own, as many at once as fit.
+
+A run that crashes, or is killed, ends no other one. SIGTERM and Ctrl-C reach the processes through a file that their
+tasks watch: Ray's own ways of ending a task leave a run no time to save.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import platform
+import signal
+import subprocess
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline.checkpoint import committed
+from pipeline.config import save_job
+from pipeline.errors import CrossrayError
+from pipeline.evaluate import check_protocols
+from pipeline.files import atomic_write
+from pipeline.launch.process import Outcome, Spec, run_one
+from pipeline.launch.run import claim_run, ensure_shards
+from pipeline.launch.tasks import Mapper, ray_tasks
+from pipeline.launch.torchrun import StopFlag, pick_device
+from pipeline.study import Run, StudyJob, Table, expand, make_tables, result_of, write_results
+from pipeline.train import checkpoints
+
+log = logging.getLogger("crossray")
+
+
+def run_study(
+    study: StudyJob, tasks: Callable[..., AbstractContextManager[Mapper]] = ray_tasks
+) -> tuple[list[Table], dict[str, str]]:
+    """Run what of a study is not done yet, and write its results.
+
+    Returns:
+        The tables, and why runs are not done: run -> how it ended, the last line of its log, and the log.
+
+    Raises:
+        CrossrayError: anything that the user has to put right; no run has been started then.
+        KeyboardInterrupt: the study was asked to stop; its runs have saved where they were.
+    """
+    runs = expand(study)
+    for run in runs:
+        check(run)
+    todo = [run for run in runs if result_of(run) is None]
+    log.info("study %s: %d runs, %d of them done", study.name, len(runs), len(runs) - len(todo))
+    for run in {(r.job.shards, r.job.scene, r.job.model.transient): r for r in reversed(todo)}.values():
+        with named(run):
+            ensure_shards(run.job)
+    failures = run_all(study, todo, tasks) if todo else {}
+    results = [result for run in runs if (result := result_of(run)) is not None]
+    tables = make_tables(study, runs, results)
+    write_results(study, results, tables, failures)
+    return tables, failures
+
+
+def check(run: Run) -> None:
+    """CrossrayError for a run that could only be refused when it is started."""
+    job = run.job
+    with named(run):
+        check_protocols(job)
+        pick_device(job, job.ranks - 1)
+    if committed(checkpoints(job)):  # a run that never came so far may have been of a job that was put right since
+        claim_run(job)
+
+
+@contextmanager
+def named(run: Run) -> Iterator[None]:
+    """An error of the block tells of which run it is."""
+    try:
+        yield
+    except CrossrayError as error:
+        raise CrossrayError(f"variant {run.variant}, scene {run.scene}: {error}") from None
+
+
+def run_all(study: StudyJob, todo: list[Run], tasks: Callable[..., AbstractContextManager[Mapper]]) -> dict[str, str]:
+    """Run them; returns why runs are not done."""
+    by_name = {run.job.name: run for run in todo}
+    source = source_of_code()
+    for run in todo:
+        save_job(run.job, run.job.run / "job.yaml")
+        atomic_write(run.job.run / "source.json", source)
+    log.info("%d to go; each writes to %s/<run>/log.txt", len(todo), study.folder)
+    failures: dict[str, str] = {}
+    stopped = False
+    stop = (study.folder / f".stop-{uuid.uuid4().hex}").absolute()
+    with (
+        stopped_by_signals(stop),
+        tasks(needs=needs_of, died=lambda spec, error: Outcome(spec.name, str(error))) as mapper,
+    ):
+        for done, outcome in enumerate(mapper(run_one, [spec_of(run, stop) for run in todo]), start=1):
+            state = "done"
+            if outcome.how is None:
+                stopped, state = True, "stopped"
+            elif result_of(by_name[outcome.name]) is None:
+                log_file = by_name[outcome.name].job.run / "log.txt"
+                failures[outcome.name], state = f"{outcome.how} ({log_file})", "crashed"
+            log.info("%s: %s (%d of %d)", outcome.name, state, done, len(todo))
+    if stopped:
+        log.info("study %s: stopped; run the same command again to go on", study.name)
+        raise KeyboardInterrupt
+    return failures
+
+
+def spec_of(run: Run, stop: Path) -> Spec:
+    """The task of a run."""
+    job, folder = run.job, Path.cwd()
+    on_gpus = pick_device(job, job.ranks - 1).type == "cuda"
+    return Spec(
+        name=job.name,
+        run=folder / job.run,
+        shards=folder / job.shards,
+        folder=folder,
+        stop=stop,
+        threads=job.threads,
+        cpus=0 if on_gpus else job.ranks * job.threads,
+        gpus=job.ranks if on_gpus else 0,
+    )
+
+
+def needs_of(spec: Spec) -> dict[str, int]:
+    """What Ray is asked for."""
+    return {"num_cpus": spec.cpus, "num_gpus": spec.gpus}
+
+
+class StopFile(StopFlag):
+    """Set by SIGTERM or Ctrl-C, and seen by the tasks as a file. A later Ctrl-C ends at once."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def stop(self, number: int, frame: object) -> None:
+        """The handler."""
+        super().stop(number, frame)
+        if not self.path.exists():
+            self.path.touch()
+            log.info("stopping: the runs save where they are (Ctrl-C again: nobody waits for them)")
+
+
+@contextmanager
+def stopped_by_signals(path: Path) -> Iterator[None]:
+    """SIGTERM and Ctrl-C make the file `path`; whatever ends the block, nothing of it is left."""
+    previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    StopFile(path).install()
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def source_of_code() -> str:
+    """JSON: the commit if this is a git checkout, marked where files have changed since, and versions."""
+    root = Path(__file__).resolve().parents[2]
+
+    def git(*words: str) -> str | None:
+        found = subprocess.run(["git", "-C", root, *words], capture_output=True, text=True, check=False)
+        return found.stdout.strip() if found.returncode == 0 else None
+
+    commit = git("rev-parse", "HEAD") if (root / ".git").exists() else None
+    versions = {name: importlib.metadata.version(name) for name in ("torch", "numpy", "ray")}
+    record: dict[str, Any] = {
+        "commit": commit and commit + ("-changed" if git("status", "--porcelain") else ""),
+        "versions": versions,
+        "python": platform.python_version(),
+        "machine": platform.processor() or platform.machine(),
+    }
+    return json.dumps(record, indent=2)

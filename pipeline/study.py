@@ -1,0 +1,411 @@
+"""Studies: many training runs from one job file, and the tables that they end in.
+
+A study is `variants` x `scenes` x `seeds`. A run is a training job put together from layers, later ones on top: `base`,
+the keys of its scene, the keys of its variant, its seed. `--set base.KEY=VALUE` comes last of all, for every run;
+`--set variants.NAME=null` and `--set scenes.NAME=null` leave one out.
+
+    <runs>/<study>/<scene>.<variant>.seed<k>/   a run like any other
+    <runs>/<study>/study.json                   every run that is done: what, how long, scores, per-image scores
+    <runs>/<study>/table.md                     mean and spread over seeds, published numbers beside them
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Iterable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import yaml
+from pydantic import ConfigDict, Field, ValidationError
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from pipeline.checkpoint import MODEL, CheckpointError, latest_checkpoint
+from pipeline.config import (
+    UNKNOWN,
+    Job,
+    JobError,
+    Section,
+    as_dict,
+    explain,
+    make_job,
+    merge,
+    nearest,
+    parse_setting,
+)
+from pipeline.evaluate import recorded
+from pipeline.files import atomic_write
+from pipeline.published import Scores, published_tables
+from pipeline.train import checkpoints
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=60)]
+Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+Keys = dict[str, Any]
+
+# Keys of a training job that the study itself decides, and how.
+TAKEN = {
+    "kind": "a study is made of training jobs",
+    "name": "a run is named after its scene, variant and seed",
+    "runs": "`runs` of the study says where its runs are",
+    "launcher": "a study starts its runs itself",
+    "patch.seed": "`seeds` of the study, or of the variant, says it",
+}
+
+METRICS = ("psnr", "ssim", "lpips")  # in this order, before all others
+BETTER = {"psnr": max, "ssim": max, "lpips": min, "mask_iou": max}  # others are shown, and nothing is called best
+DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 0, "steps": 0}  # others: 3
+
+RULE = (
+    "Cells are mean ± sample standard deviation over seeds (number of seeds). Bold: the best mean of a column and all "
+    "that are tied with it, which is where the difference of two means is at most sqrt(sd_a² + sd_b²). A row of one "
+    "seed has no spread: it is compared with none, and nothing of it is bold."
+)
+PUBLISHED = (
+    "Published: `{}` in pipeline/published.yaml, numbers of the paper for its own scenes and its own training. They "
+    "stand beside ours and are not compared with them."
+)
+
+
+class Variant(Section):
+    """Keys of a training job on top of `base` and the scene's, and the variant's own seeds if it has any."""
+
+    model_config = ConfigDict(extra="allow")
+
+    seeds: Seeds | None = None
+    """Instead of the study's."""
+
+    @property
+    def keys(self) -> Keys:
+        """The keys of the training job."""
+        return self.model_extra or {}
+
+
+class StudyJob(Section):
+    """A study: training jobs that share what can be shared, and tables over their results."""
+
+    kind: Literal["study"] = "study"
+    """What the job does."""
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)
+    """Name of the study: its runs are in `<runs>/<name>`; running it again goes on where it was."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    base: Keys = Field({})
+    """Keys of a training job that all runs have in common."""
+    variants: Annotated[dict[Name, Variant], Field(min_length=1)]
+    """What is compared: the rows of the tables."""
+    scenes: Annotated[dict[Name, Keys], Field(min_length=1)]
+    """Scenes, with the protocols that suit them: a table each scene and protocol."""
+    seeds: Seeds = (0,)
+    """Every variant is trained once a seed (`patch.seed`)."""
+    published: str | None = None
+    """Table of pipeline/published.yaml whose rows are named like the variants."""
+
+    @property
+    def folder(self) -> Path:
+        """Where everything of the study is."""
+        return self.runs / self.name
+
+
+class Run(NamedTuple):
+    """One training run of a study."""
+
+    scene: str
+    variant: str
+    seed: int
+    job: Job
+
+
+# ---------------------------------------------------------------------------------------------------- from the file
+
+
+def read_kind(path: Path) -> str:
+    """The `kind` of a job file. "train" for a file that cannot be read: `load_job` says what is wrong with it."""
+    try:
+        raw = yaml.safe_load(path.read_text())
+    except (OSError, yaml.YAMLError, ValueError):
+        return "train"
+    return str(raw.get("kind", "train")) if isinstance(raw, dict) else "train"
+
+
+def load_study(path: Path, settings: Sequence[str] = ()) -> StudyJob:
+    """The study in a YAML file of this kind (`read_kind`), with `key.sub=value` settings on top.
+
+    Raises:
+        JobError: a key or a value is wrong; the message names it, and where there is one the variant and the scene.
+    """
+    return make_study(yaml.safe_load(path.read_text()), settings, source=str(path))
+
+
+def make_study(raw: Keys, settings: Sequence[str] = (), source: str = "study") -> StudyJob:
+    """Like load_study, from a mapping."""
+    for setting in settings:
+        raw = apply(raw, parse_setting(setting))
+    try:
+        study = StudyJob.model_validate(raw)
+    except ValidationError as error:
+        raise JobError("\n".join(f"{source}: {explain_study(e)}" for e in error.errors())) from None
+    check_taken(study, source)
+    check_seeds(study, source)
+    if study.published is not None and study.published not in published_tables():
+        raise JobError(
+            f"{source}: published: there is no table {study.published!r}"
+            f"{nearest(study.published, list(published_tables()))}"
+        )
+    expand(study, source)
+    return study
+
+
+def apply(raw: Keys, setting: Keys) -> Keys:
+    """`raw` with one setting on top: one of `base` wins over scenes and variants, and null leaves one of these out."""
+    raw = merge(raw, setting)
+    if "base" in setting:
+        raw["variants"] = {
+            name: merge(keys, as_dict(setting["base"])) if isinstance(keys, dict) else keys
+            for name, keys in as_dict(raw.get("variants")).items()
+        }
+    for part in ("variants", "scenes"):
+        for name, keys in as_dict(setting.get(part)).items():
+            if keys is None:
+                raw[part] = {k: v for k, v in raw[part].items() if k != name}
+    return raw
+
+
+def explain_study(error: Any) -> str:
+    """One pydantic error of a study, as `pipeline.config.explain` puts those of a job."""
+    if error["type"] in UNKNOWN:
+        key = str(error["loc"][-1])
+        return f"{key}: there is no such key{nearest(key, list(StudyJob.model_fields))}"
+    return explain(error)
+
+
+def check_seeds(study: StudyJob, source: str) -> None:
+    """JobError for a seed that is there twice: both runs would be the same one."""
+    lists = {"seeds": study.seeds} | {f"variants.{name}.seeds": v.seeds or () for name, v in study.variants.items()}
+    for key, seeds in lists.items():
+        if len(set(seeds)) < len(seeds):
+            raise JobError(f"{source}: {key}: one of {', '.join(map(str, seeds))} is there twice")
+
+
+def check_taken(study: StudyJob, source: str) -> None:
+    """JobError for a key that the study itself decides."""
+    layers = {"base": study.base}
+    layers |= {f"scenes.{name}": keys for name, keys in study.scenes.items()}
+    layers |= {f"variants.{name}": variant.keys for name, variant in study.variants.items()}
+    for (layer, keys), (key, reason) in product(layers.items(), TAKEN.items()):
+        section, _, last = key.rpartition(".")
+        if last in (as_dict(keys.get(section)) if section else keys):
+            raise JobError(f"{source}: {layer}.{key}: cannot be set here, {reason}")
+
+
+def expand(study: StudyJob, source: str = "study") -> list[Run]:
+    """Every run of the study, in the order in which they are best done: each variant once before any twice.
+
+    Raises:
+        JobError: a training job that cannot be; the message names the variant and the scene.
+    """
+    runs = [
+        Run(scene, name, seed, run_job_of(study, scene, name, seed, f"{source}: variant {name}, scene {scene}"))
+        for (scene, (name, variant)) in product(study.scenes, study.variants.items())
+        for seed in variant.seeds or study.seeds
+    ]
+    return sorted(runs, key=lambda run: run.seed)
+
+
+def run_job_of(study: StudyJob, scene: str, variant: str, seed: int, source: str) -> Job:
+    """The training job of one run. Its shards are where those of a job in `study.runs` would be, so that all share."""
+    keys = merge(merge(study.base, study.scenes[scene]), study.variants[variant].keys)
+    ours = {"name": f"{scene}.{variant}.seed{seed}", "runs": str(study.runs), "patch": {"seed": seed}}
+    job = make_job(merge(keys, ours), source=source)
+    shards = job.scene.model_copy(update={"shards": job.shards})
+    return job.model_copy(update={"runs": study.folder, "scene": shards})
+
+
+# -------------------------------------------------------------------------------------------------------- results
+
+
+def result_of(run: Run) -> Keys | None:
+    """What study.json says of a run; None unless it was trained to its end and evaluated under every protocol."""
+    job = run.job
+    try:
+        training = json.loads((job.run / "training.json").read_text())
+        checkpoint = latest_checkpoint(checkpoints(job))
+    except (FileNotFoundError, CheckpointError):
+        return None
+    if checkpoint is None or not checkpoint.meta["finished"] or training["steps"] != checkpoint.step:
+        return None
+    scores = {name: recorded(job.run, name, checkpoint) for name in job.evaluate.protocols}
+    if any(score is None for score in scores.values()):
+        return None
+    source = job.run / "source.json"
+    return {
+        "run": str(job.run),
+        "scene": run.scene,
+        "variant": run.variant,
+        "seed": run.seed,
+        "steps": training["steps"],
+        "seconds": training["train_seconds"],
+        "device": training["device"],
+        "ranks": training["ranks"],
+        "checkpoint_sha256": checkpoint.meta["sha256"][MODEL],
+        "source": json.loads(source.read_text()) if source.is_file() else None,
+        "protocols": {
+            name: {key: score[key] for key in ("mean", "images", "seconds", "versions") if key in score}
+            for name, score in scores.items()
+            if score is not None
+        },
+    }
+
+
+def write_results(study: StudyJob, results: Sequence[Keys], tables: Sequence[Table], failures: Keys) -> None:
+    """study.json and table.md in the study's folder."""
+    record = {"study": study.model_dump(mode="json"), "runs": list(results), "failures": failures}
+    atomic_write(study.folder / "study.json", json.dumps(record, indent=2))
+    atomic_write(study.folder / "table.md", as_markdown(study, tables, failures))
+
+
+# --------------------------------------------------------------------------------------------------------- tables
+
+
+class Spread(NamedTuple):
+    """Mean and sample standard deviation of n numbers; the latter is None for one number."""
+
+    mean: float
+    sd: float | None
+    n: int
+
+
+class Cell(NamedTuple):
+    """What stands in a table."""
+
+    text: str
+    best: bool = False
+
+
+class Table(NamedTuple):
+    """One scene under one protocol."""
+
+    title: str
+    header: list[str]
+    rows: list[list[Cell]]
+
+
+def spread(values: Iterable[float]) -> Spread | None:
+    """Of numbers, one a seed; None where there are none."""
+    values = list(values)
+    if not values:
+        return None
+    return Spread(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None, len(values))
+
+
+def tied_with_best(column: Sequence[Spread | None], better: Any) -> list[bool]:
+    """Which rows have the best mean or one tied with it (RULE); none unless two rows have a spread."""
+    compared = [s for s in column if s is not None and s.sd is not None]
+    if len(compared) < 2:
+        return [False] * len(column)
+    mean, sd, _ = better(compared, key=lambda s: s.mean)
+    return [s is not None and s.sd is not None and abs(s.mean - mean) <= math.hypot(s.sd, sd) for s in column]
+
+
+def make_tables(study: StudyJob, runs: Sequence[Run], results: Sequence[Keys]) -> list[Table]:
+    """A table each scene and protocol, the variants in their order."""
+    tables = []
+    for scene in study.scenes:
+        protocols = dict.fromkeys(p for run in runs if run.scene == scene for p in run.job.evaluate.protocols)
+        for protocol in protocols or [None]:
+            tables.append(make_table(study, scene, protocol, [r for r in results if r["scene"] == scene]))
+    return tables
+
+
+def make_table(study: StudyJob, scene: str, protocol: str | None, results: Sequence[Keys]) -> Table:
+    """One scene's runs under one protocol (None: nothing was evaluated)."""
+    measured: dict[str, list[dict[str, float]]] = {name: [] for name in study.variants}  # variant -> one a seed
+    for result in results:
+        mean = result["protocols"].get(protocol, {}).get("mean", {})
+        scores = {key: value for key, value in mean.items() if value is not None}
+        measured[result["variant"]].append(scores | {"seconds": result["seconds"], "steps": result["steps"]})
+    found = dict.fromkeys(key for rows in measured.values() for row in rows for key in row)
+    metrics = [m for m in METRICS if m in found] + [m for m in found if m not in (*METRICS, "seconds", "steps")]
+    columns = [column_of(metric, measured) for metric in (*metrics, "seconds", "steps")]
+    header, beside = published_columns(study)
+    return Table(
+        f"{scene}, {protocol}" if protocol else scene,
+        ["variant", *(title_of(m) for m in metrics), "training seconds", "steps", *header],
+        [[Cell(name), *cells, *beside[name]] for name, *cells in zip(study.variants, *columns, strict=True)],
+    )
+
+
+def column_of(metric: str, measured: dict[str, list[dict[str, float]]]) -> list[Cell]:
+    """A metric's cells, one a variant."""
+    column = [spread(row[metric] for row in rows if metric in row) for rows in measured.values()]
+    best = tied_with_best(column, BETTER[metric]) if metric in BETTER else [False] * len(column)
+    return [Cell(shown(value, metric), mark) for value, mark in zip(column, best, strict=True)]
+
+
+def published_columns(study: StudyJob) -> tuple[list[str], dict[str, list[Cell]]]:
+    """Of the study's published table: a title each scene, and each variant's cells, all metrics in one."""
+    table = published_tables()[study.published] if study.published else {}
+    rows: dict[str, Scores] = {name: table.get(name, {}) for name in study.variants}
+    scenes = dict.fromkeys(scene for row in rows.values() for scene in row)
+    metrics = [m for m in METRICS if any(m in scores for row in rows.values() for scores in row.values())]
+    header = [f"published: {scene}, {' / '.join(map(title_of, metrics))}" for scene in scenes]
+    cells = {
+        name: [
+            Cell(" / ".join(decimal(row[scene].get(m), m) for m in metrics) if scene in row else "-")
+            for scene in scenes
+        ]
+        for name, row in rows.items()
+    }
+    return header, cells
+
+
+def title_of(metric: str) -> str:
+    """psnr -> PSNR, mask_iou -> mask IoU."""
+    return metric.upper() if metric in METRICS else metric.replace("_", " ").replace("iou", "IoU")
+
+
+def decimal(value: float | None, metric: str) -> str:
+    """A number with the metric's decimals, - where there is none."""
+    return "-" if value is None else f"{value:.{DECIMALS.get(metric, 3)}f}"
+
+
+def shown(value: Spread | None, metric: str) -> str:
+    """mean ± sd (n)."""
+    if value is None:
+        return "-"
+    deviation = "" if value.sd is None else f" ± {decimal(value.sd, metric)}"
+    return f"{decimal(value.mean, metric)}{deviation} ({value.n})"
+
+
+def captions(study: StudyJob) -> list[str]:
+    """What a reader of the tables has to know."""
+    return [RULE, *([PUBLISHED.format(study.published)] if study.published else [])]
+
+
+def as_markdown(study: StudyJob, tables: Sequence[Table], failures: Keys) -> str:
+    """The study's page."""
+    lines = [f"# {study.name}", "", *(line for caption in captions(study) for line in (caption, ""))]
+    for table in tables:
+        lines += [f"## {table.title}", "", row_of(table.header), row_of(["---"] * len(table.header))]
+        lines += [row_of([f"**{cell.text}**" if cell.best else cell.text for cell in row]) for row in table.rows]
+        lines.append("")
+    if failures:
+        lines += ["## Not done", "", *(f"- {name}: {reason}" for name, reason in failures.items()), ""]
+    return "\n".join(lines)
+
+
+def as_rich(table: Table) -> RichTable:
+    """For a terminal."""
+    shape = RichTable(*table.header, title=table.title)
+    shape.columns[0].no_wrap = True
+    for row in table.rows:
+        shape.add_row(*(Text(cell.text, style="bold" if cell.best else "") for cell in row))
+    return shape
+
+
+def row_of(cells: Iterable[str]) -> str:
+    """A row of a Markdown table."""
+    return f"| {' | '.join(cells)} |"
