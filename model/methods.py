@@ -92,9 +92,9 @@ class ModelSpec:
     """Channels of a feature (with colour `decoder`)."""
     encoder: Literal["released", "compact"] = "released"
     """Networks that read a photo's appearance: the released code's, or small ones for small pictures."""
-    transform: Literal["learned", "mean_only", "closed_form"] = "learned"
-    """How `crossray` makes one appearance into another: `learned` as released; `mean_only` without second moments, the
-    control for them; `closed_form` by Proposition 1, with nothing learned."""
+    transform: Literal["learned", "style_only", "mean_only", "closed_form"] = "learned"
+    """How `crossray` makes one appearance into another: `learned` as released; `style_only` without the second moment
+    over rays, `mean_only` without any, the controls for them; `closed_form` by Proposition 1, with nothing learned."""
     segmenter: Literal["cgnet", "unet"] = "cgnet"
     """Segmenter network: the released code's, or a small U-Net whose masks are as fine as its input."""
     pixel_center: float = 0.0

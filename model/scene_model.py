@@ -505,10 +505,10 @@ def make_transform(spec: ModelSpec) -> Transform:
     """T as `spec` wants it."""
     if spec.transform == "closed_form":
         return ClosedFormTransform(spec.channels)
-    covariance = spec.transform == "learned"
+    moments = {"content": spec.transform == "learned", "style": spec.transform != "mean_only"}
     if spec.encoder == "compact":
-        return CompactTransform(spec.channels, covariance=covariance)
-    return ReleasedTransform(spec.channels, covariance=covariance)
+        return CompactTransform(spec.channels, **moments)
+    return ReleasedTransform(spec.channels, **moments)
 
 
 def embed(encoder: nn.Module, images: list[Tensor]) -> Tensor:

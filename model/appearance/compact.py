@@ -55,19 +55,19 @@ class CompactTransform(nn.Module):
     Args:
         channels: C of a feature and of an embedding.
         compressed: c, side of the matrices.
-        covariance: False leaves the second moments out: T(F) = F + U K (F - mu_cr) + v(mu_a). A control: what is left
-            is the means alone.
+        content, style: False leaves that second moment out. Controls: without the content's, T no longer looks across
+            rays but for their mean; without both, T(F) = F + U K (F - mu_cr) + v(mu_a).
     """
 
-    def __init__(self, channels: int, compressed: int = 16, covariance: bool = True) -> None:
+    def __init__(self, channels: int, compressed: int = 16, content: bool = True, style: bool = True) -> None:
         super().__init__()
         self.compressed = compressed
-        self.moment_size = compressed if covariance else 0
+        self.moment_size = compressed if content else 0
         self.compress = nn.Linear(channels, compressed, bias=False)
-        self.content = nn.Linear(channels, compressed) if covariance else None
-        self.style = nn.Linear(channels, compressed) if covariance else None
-        self.content_matrix = nn.Linear(compressed**2, compressed**2) if covariance else None
-        self.style_matrix = nn.Linear(compressed**2, compressed**2) if covariance else None
+        self.content = nn.Linear(channels, compressed) if content else None
+        self.style = nn.Linear(channels, compressed) if style else None
+        self.content_matrix = nn.Linear(compressed**2, compressed**2) if content else None
+        self.style_matrix = nn.Linear(compressed**2, compressed**2) if style else None
         self.unzip = nn.Linear(compressed, channels, bias=False)
         self.shift = nn.Sequential(nn.Linear(channels, 64), nn.LeakyReLU(0.2), nn.Linear(64, channels))
         for layer in (self.content_matrix, self.style_matrix):

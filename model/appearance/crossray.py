@@ -121,17 +121,17 @@ class ReleasedTransform(nn.Module):
     Args:
         channels: C of a feature and of an embedding.
         compressed: c, side of the matrices.
-        covariance: False leaves the second moments out: T(F) = expand(compress(F - mu_cr)) + mu_a. A control: what
-            is left is the means alone.
+        content, style: False leaves that second moment out. Controls: without the content's, T no longer looks across
+            rays but for their mean; without both, T(F) = expand(compress(F - mu_cr)) + mu_a.
     """
 
-    def __init__(self, channels: int = 64, compressed: int = 32, covariance: bool = True) -> None:
+    def __init__(self, channels: int = 64, compressed: int = 32, content: bool = True, style: bool = True) -> None:
         super().__init__()
-        self.moment_size = compressed if covariance else 0
+        self.moment_size = compressed if content else 0
         self.compress = nn.Linear(channels, compressed)
         self.expand = nn.Linear(compressed, channels)
-        self.content = MomentNet(channels, compressed) if covariance else NoMoment(compressed)
-        self.style = MomentNet(channels, compressed) if covariance else NoMoment(compressed)
+        self.content = MomentNet(channels, compressed) if content else NoMoment(compressed)
+        self.style = MomentNet(channels, compressed) if style else NoMoment(compressed)
 
     def content_statistics(self, features: Tensor) -> ContentStatistics:
         """Of features (P, N, C). The order of the rays does not matter; ValueError if there are none."""

@@ -18,7 +18,8 @@ PHOTOS = 4  # training photos
 
 # Every row of the table, and each once more on the fast field with the parts that its recipe picks.
 ROWS = [*METHODS, *(f"{name}-fast" for name in METHODS)]
-TRANSFORMS = ["crnerf-mean_only", "crnerf-closed_form", "crossray-mean_only-fast", "crossray-closed_form-fast"]
+OTHER_TRANSFORMS = ("style_only", "mean_only", "closed_form")
+TRANSFORMS = [name for t in OTHER_TRANSFORMS for name in (f"crnerf-{t}", f"crossray-{t}-fast")]
 
 
 def small_spec(row: str) -> ModelSpec:
@@ -26,10 +27,10 @@ def small_spec(row: str) -> ModelSpec:
     fast = row.endswith("-fast")
     name = row.removesuffix("-fast")
     transform = name.partition("-")[2]
-    if transform in ("mean_only", "closed_form"):
+    if transform in OTHER_TRANSFORMS:
         name = name.removesuffix(f"-{transform}")
     spec = ModelSpec(**METHODS[name].axes(), mlp=MLP, hash=HASH)
-    if transform in ("mean_only", "closed_form"):
+    if transform in OTHER_TRANSFORMS:
         spec = replace(spec, transform=transform)
     return replace(spec, field="hash", channels=8, encoder="compact", segmenter="unet") if fast else spec
 

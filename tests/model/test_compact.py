@@ -158,7 +158,7 @@ def test_area_resize_by_hand():
 
 def means_only() -> CompactTransform:
     torch.manual_seed(0)
-    transform = CompactTransform(C, compressed=SMALL, covariance=False)
+    transform = CompactTransform(C, compressed=SMALL, content=False, style=False)
     for parameter in transform.parameters():
         parameter.data += 0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3))
     return transform

@@ -165,7 +165,7 @@ def squeezed(features: Tensor) -> Tensor:
 
 def means_only() -> ReleasedTransform:
     torch.manual_seed(0)
-    return ReleasedTransform(channels=6, compressed=4, covariance=False)
+    return ReleasedTransform(channels=6, compressed=4, content=False, style=False)
 
 
 def test_without_covariance_only_compression_and_means_are_left():
@@ -181,7 +181,7 @@ def test_without_covariance_only_compression_and_means_are_left():
     ]
     torch.testing.assert_close(features @ W.mT + b[:, None], torch.stack(expected), atol=1e-6, rtol=1e-5)
     # Of the 2,140,704 parameters the two moment networks are all but 64 32 + 32 and 32 64 + 64.
-    assert sum(p.numel() for p in ReleasedTransform(covariance=False).parameters()) == 4_192
+    assert sum(p.numel() for p in ReleasedTransform(content=False, style=False).parameters()) == 4_192
 
 
 @pytest.mark.parametrize("covariance", [True, False])

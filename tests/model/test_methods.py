@@ -121,9 +121,8 @@ def every_choice() -> list[ModelSpec]:
 def test_every_accepted_choice_takes_a_step_and_renders():
     """No part may assume a neighbour: all combinations, not only the rows."""
     specs = every_choice()
-    assert len(specs) == 2 * 5 * (
-        2 * 3 + 2 * 3
-    )  # fields, transients; colours x {none, embedding, code} + 3 x 2 ray/point
+    codes, rays = 2 * 3, 2 * 4  # colours x appearances that are no crossray; places of fusion x transforms
+    assert len(specs) == 2 * 5 * (codes + rays)  # fields x transients
     batch = small_batch(k=4)
     for spec in specs:
         model = SceneModel(spec, BOX, PHOTOS)

@@ -230,7 +230,11 @@ def test_the_ablation_has_every_row_of_the_methods():
     assert all(jobs[name].method == name for name in METHODS.keys() - {"crossray"})
     ours = make_job({"name": "x", "method": "crossray", "scene": {"path": "data/landmark"}})
     assert jobs["crnerf"].model == ours.model  # so a row `crossray` would be the same again
-    assert {jobs[f"crnerf-{t}"].model.transform for t in ("mean-only", "closed-form")} == {"mean_only", "closed_form"}
+    assert {jobs[f"crnerf-{t}"].model.transform for t in ("style-only", "mean-only", "closed-form")} == {
+        "style_only",
+        "mean_only",
+        "closed_form",
+    }
     assert (jobs["hanerf"].losses.appearance, jobs["hanerf"].losses.mode_seeking) == (1e-3, 1e-6)
     rows = published_tables()[study.published]
     assert rows.keys() == METHODS.keys() - {"crossray", "crnerf-a-masks"}
