@@ -65,7 +65,7 @@ def loss_terms(spec: ModelSpec, weights: LossWeights) -> list[str]:
         "interlevel": spec.field == "hash" and weights.interlevel > 0,
         "mask": spec.transient in ("segmenter", "uvmask") and max(weights.mask_start, weights.mask_end) > 0,
         "uncertainty": spec.transient == "uncertainty",
-        "transient_density": spec.transient == "uncertainty",
+        "transient_density": spec.transient == "uncertainty" and weights.transient_density > 0,
         "appearance": reads and weights.appearance > 0,
         "embedding": reads and weights.embedding > 0,
         "mode_seeking": codes and weights.mode_seeking > 0,
@@ -156,7 +156,8 @@ def embedding_size(embedding: Tensor) -> Tensor:
 def mode_seeking(picture: Tensor, other_picture: Tensor, code: Tensor, other_code: Tensor) -> Tensor:
     """1 / (mean |Cf - Cf_r| / mean |a - a_r| + 1e-5): other codes shall give other pictures (Ha-NeRF, released code).
 
-    Only `other_picture` carries a gradient. Where both codes are equal (one photo alone) it is 1e5, a constant.
+    Both means are over all patches. Only `other_picture` carries a gradient. Where both codes are equal (one photo
+    alone) it is 1e5, a constant.
     """
     apart = (code.detach() - other_code.detach()).abs().mean()
     ratio = (picture.detach() - other_picture).abs().mean() / apart.clamp(min=1e-12)

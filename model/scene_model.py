@@ -250,11 +250,13 @@ class SceneModel(nn.Module):
         both = at_least_float32(transient.composite(level)).unflatten(0, patches)
         picture = self.colours(both, appearance, static.content)
         beta = transient.uncertainty().unflatten(0, patches) + weights.beta_min
-        return {
+        terms = {
             "fine": weights.photometric * uncertain_photometric(picture, batch.colours, beta),
             "uncertainty": 2 * weights.photometric * log_uncertainty(beta),
-            "transient_density": weights.transient_density * transient.density.mean(),
         }
+        if weights.transient_density > 0:
+            terms["transient_density"] = weights.transient_density * transient.density.mean()
+        return terms
 
     def autocast(self, device: torch.device) -> AbstractContextManager:
         """bfloat16 inside the field where it pays; statistics, transform and losses stay in float32."""
@@ -431,29 +433,31 @@ class SceneModel(nn.Module):
     def transient_opacity(self, rays: Rays, photo: int) -> Tensor:
         """(R,) share of each ray's light that a training photo's transient field gives: NeRF-W's counterpart of M."""
         assert self.transient_embedding is not None
-        number = torch.tensor([photo], device=rays.near.device)
-        appearance = None if self.embedding is None else self.embedding(number)
-        found = [m.transient for m in self.marches(rays, None, None, appearance, self.transient_embedding(number))]
-        return torch.cat([t.opacity() for t in found if t is not None])
+        code = self.transient_embedding(torch.tensor([photo], device=rays.near.device))
+        parts = []
+        for part in self.chunks(rays, None, None):
+            with self.autocast(rays.near.device):
+                found = self.field.look_at_transients(self.field.place(part), code.expand(len(part.near), -1))
+            assert found is not None
+            parts.append(found.opacity())
+        return torch.cat(parts)
 
     def marches(
-        self,
-        rays: Rays,
-        chunk: int | None,
-        samples: tuple[int, int] | None,
-        code: Tensor | None = None,
-        transient: Tensor | None = None,
+        self, rays: Rays, chunk: int | None, samples: tuple[int, int] | None, code: Tensor | None = None
     ) -> Iterator[March]:
-        """The field along all rays, chunk by chunk, in the codes (1, .) of one photo."""
+        """The field along all rays, chunk by chunk, in one appearance code (1, CODE) where it reads one."""
         if self.coded and code is None:
             raise ValueError(f"model.appearance: {self.spec.appearance} needs the code of an appearance to render")
-        chunk = chunk or max(1, RENDER_POINTS // self.field.points_a_ray(samples))
-        for start in range(0, len(rays.near), chunk):
-            part = Rays(*(r[start : start + chunk] for r in rays))
-            count = len(part.near)
-            codes = Codes(*(None if c is None else c.expand(count, -1) for c in (code, None, transient)))
+        for part in self.chunks(rays, chunk, samples):
+            codes = Codes(None if code is None else code.expand(len(part.near), -1))
             with self.autocast(rays.near.device):
                 yield self.field.march(part, samples=samples, codes=codes)
+
+    def chunks(self, rays: Rays, chunk: int | None, samples: tuple[int, int] | None) -> Iterator[Rays]:
+        """The rays, `chunk` at a time, or as many as RENDER_POINTS allows."""
+        chunk = chunk or max(1, RENDER_POINTS // self.field.points_a_ray(samples))
+        for start in range(0, len(rays.near), chunk):
+            yield Rays(*(r[start : start + chunk] for r in rays))
 
     def picture(self, placed: Placed, code: Tensor, transient: Tensor | None) -> Tensor:
         """rgb (R, 3) at placed samples, with gradient to the codes (1, .): what a code is fitted with."""

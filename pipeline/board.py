@@ -62,7 +62,8 @@ def write_pictures(writer: SummaryWriter, step: int, model: SceneModel, photos: 
     depth = (view.depth / view.depth.max().clamp(min=1e-6)).cpu().numpy()
     writer.add_image("view/depth", depth, step, dataformats="HW")
     writer.add_scalar("view/psnr", psnr_of(float(np.square(picture - photo).mean())), step)
-    mask = predicted_mask(model, photos, index if model.segmenter is not None else photos.indices("train")[0])
+    masked = index if model.segmenter is not None else photos.indices("train")[0]
+    mask = predicted_mask(model, photos, masked, stride)
     if mask is not None:
         writer.add_image("view/mask", mask, step, dataformats="HW")
     model.train()

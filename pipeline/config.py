@@ -227,7 +227,8 @@ def check_patch(job: Job) -> None:
     """Refuse patches that the appearance losses cannot encode, and colours that nothing could explain."""
     model, losses = job.model, job.losses
     least = smallest_side(model)
-    if job.patch.size < least and (losses.appearance > 0 or losses.content > 0):
+    compares_content = model.appearance == "crossray" and losses.content > 0
+    if job.patch.size < least and (losses.appearance > 0 or compares_content):
         raise ValueError(
             f"patch.size: {job.patch.size} is too small for the appearance losses with model.appearance: "
             f"{model.appearance} and model.encoder: released, which encode a rendered patch; at least {least}"

@@ -23,6 +23,7 @@ import yaml
 from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
+from model.methods import smallest_side
 from model.scene_model import SceneModel
 from pipeline.checkpoint import (
     MODEL,
@@ -87,7 +88,10 @@ def parse_protocol(name: str) -> tuple[Protocol, int, bool]:
     if match[1] not in known:
         raise CrossrayError(f"protocol {match[1]!r} is not known (known: {', '.join(known)})")
     text = files("pipeline.protocols").joinpath(f"{match[1]}.yaml").read_text()
-    return Protocol.model_validate(yaml.safe_load(text)), int(match[2]), match[3] is not None
+    protocol, affine = Protocol.model_validate(yaml.safe_load(text)), match[3] is not None
+    if affine and protocol.appearance == "elsewhere":
+        raise CrossrayError(f"protocol {name}: the affine control looks at the scored photo, which {match[1]} forbids")
+    return protocol, int(match[2]), affine
 
 
 def load_run(
@@ -218,6 +222,7 @@ class Judge:
         if self.appearance_from == "left":
             reference = left_half(reference)
         if self.model.embedding is None:
+            self.check_reference(reference, index)
             return read_appearance(self.model, reference)
         key = (index, self.appearance_from)
         if key not in self.codes:
@@ -225,6 +230,16 @@ class Judge:
             camera = self.photos.records[source]
             self.codes[key] = fit_code(self.model, image, camera, columns, self.recipe, seed=index)
         return self.codes[key]
+
+    def check_reference(self, reference: np.ndarray, index: int) -> None:
+        """CrossrayError where what may be seen of a photo is too small for the appearance network."""
+        least, (height, width) = smallest_side(self.model.spec), reference.shape[:2]
+        if min(height, width) < least:
+            raise CrossrayError(
+                f"{self.photos.records[index].name}: {width} x {height} pixels of its reference may be read "
+                f"({self.appearance_from}), and model.encoder: released reads no side under {least}; cut the shards "
+                "with a smaller scene.reference_downscale"
+            )
 
     @property
     def recipe(self) -> FitRecipe:
@@ -352,9 +367,11 @@ def run_protocols(job: Job) -> list[dict[str, Any]]:
 
 
 def recorded(run: Path, protocol_name: str, checkpoint: Checkpoint) -> dict[str, Any] | None:
-    """An evaluation of just this checkpoint, if it was made before."""
+    """An evaluation of just this checkpoint under just this definition of the protocol, if it was made before."""
     path = run / "eval" / protocol_name / checkpoint.folder.name / "metrics.json"
     if not path.is_file():
         return None
     result = json.loads(path.read_text())
-    return result if result["checkpoint_sha256"] == checkpoint.meta["sha256"][MODEL] else None
+    definition = parse_protocol(protocol_name)[0].model_dump(mode="json")
+    same = result["checkpoint_sha256"] == checkpoint.meta["sha256"][MODEL] and result["definition"] == definition
+    return result if same else None

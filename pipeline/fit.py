@@ -24,7 +24,7 @@ DECAYS = 3  # the learning rate falls to a tenth after each third of the steps
 
 
 class FitRecipe(BaseModel):
-    """How a code is fitted; the defaults are those of the public re-evaluation of NeRF-W (nerfbaselines)."""
+    """How a code is fitted; the defaults are the numbers of NeRF-W's public re-evaluation (nerfbaselines)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

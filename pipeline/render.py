@@ -107,21 +107,24 @@ def render_picture(
     return view, colour_view(model, view, appearance)
 
 
-def predicted_mask(model: SceneModel, photos: Photos, index: int) -> np.ndarray | None:
-    """Transient probability, float32 (h, w), of a photo as the model has it; None where it has none.
+def predicted_mask(model: SceneModel, photos: Photos, index: int, stride: int = 1) -> np.ndarray | None:
+    """Transient probability, float32, of every `stride`-th pixel of every `stride`-th row of a photo as the model has
+    it, (h, w) for all of them; None where it has none.
 
     A model with a transient field is asked how much of each ray's light comes from it.
     """
-    image, train = photos.image(index), photos.indices("train")
+    camera, train = photos.records[index], photos.indices("train")
     number = train.index(index) if index in train else None
+    rows = cols = slice(stride // 2, None, stride)
     if model.spec.transient == "fixed":
         mask = photos.mask(index)
-        return None if mask is None else mask.astype(np.float32) / 255
+        return None if mask is None else mask[rows, cols].astype(np.float32) / 255
     device = next(model.parameters()).device
     if model.transient_embedding is not None:
         if number is None:
             return None
-        rays = view_rays(photos.records[index], model.spec.pixel_center, device)
-        return model.transient_opacity(rays, number).view(image.shape[:2]).cpu().numpy()
-    found = model.transient_mask(image.shape[:2], as_tensor(photos.reference(index), device), number)
-    return None if found is None else found.cpu().numpy()
+        size = (len(range(camera.height)[rows]), len(range(camera.width)[cols]))
+        rays = view_rays(camera, model.spec.pixel_center, device, stride)
+        return model.transient_opacity(rays, number).view(size).cpu().numpy()
+    found = model.transient_mask((camera.height, camera.width), as_tensor(photos.reference(index), device), number)
+    return None if found is None else found[rows, cols].cpu().numpy()

@@ -169,8 +169,6 @@ def train(job: Job, context: Context) -> dict[str, Any]:
             rate = (clock.step - last_log[0]) * work.rays_a_step / (time.perf_counter() - last_log[1])
             write_scalars(writer, clock.step, terms, watched, optimiser, rate)
             last_log = (clock.step, time.perf_counter())
-        if writer is not None and (clock.step % job.train.picture_every == 0 or clock.done):
-            write_pictures(writer, clock.step, model, photos)
         if save_now:
             if lead and clock.step != last_saved:
                 meta = identity | {
@@ -182,6 +180,8 @@ def train(job: Job, context: Context) -> dict[str, Any]:
                 save_checkpoint(checkpoints(job), clock.step, model.state_dict(), optimiser.state_dict(), meta)
                 prune(checkpoints(job), job.train.keep_checkpoints)
             last_saved = clock.step
+        if writer is not None and (clock.step % job.train.picture_every == 0 or clock.done):
+            write_pictures(writer, clock.step, model, photos)  # after saving: nothing that it meets can lose a step
         if stopped:
             break
     progress.close()

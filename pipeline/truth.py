@@ -15,8 +15,12 @@ from pipeline.render import predicted_mask
 MASK_THRESHOLD = 0.5
 
 
-def check_truth(job: Job) -> None:
-    """CrossrayError where the scene is not the landmark, is not at hand, or its photos were reduced."""
+def check_truth(job: Job) -> Landmark:
+    """The landmark that a job's photos are of.
+
+    Raises:
+        CrossrayError: the scene is another one or not at hand, or its photos were reduced.
+    """
     if not (job.scene.path / "truth" / "landmark.json").is_file():
         raise CrossrayError(
             f"scene.path: {job.scene.path} holds no truth; only the built-in landmark (`crossray landmark`) knows its "
@@ -27,22 +31,27 @@ def check_truth(job: Job) -> None:
             f"scene.downscale: the landmark's truth is known at the size of its photos alone, and these are at "
             f"R{job.scene.downscale}; train with --set scene.downscale=1"
         )
+    return Landmark.read(job.scene.path)
 
 
 def truth_of(job: Job, photos: Photos) -> Landmark:
     """The truth behind a job's photos.
 
     Raises:
-        CrossrayError: there is none (`check_truth`), or it is of other photos.
+        CrossrayError: there is none (`check_truth`), it is of other photos, or there is one test photo alone, whose
+            light could be read from no other view.
     """
-    check_truth(job)
-    landmark = Landmark.read(job.scene.path)
-    for index in photos.indices("test"):
-        name = photos.records[index].name
-        shape = landmark.truth(name, name).shape
-        if shape != photos.image(index).shape:
+    landmark = check_truth(job)
+    test = photos.indices("test")
+    if len(test) < 2:
+        raise CrossrayError(f"{job.scene.path}: one test photo; to read its light from elsewhere takes two at least")
+    for index in test:
+        name, (height, width) = photos.records[index].name, photos.image(index).shape[:2]
+        camera = landmark.record(name).camera
+        if (camera.height, camera.width) != (height, width):
             raise CrossrayError(
-                f"{job.scene.path}: the truth of {name} is {shape}, its photo {photos.image(index).shape}"
+                f"{job.scene.path}: the truth of {name} is {camera.width} x {camera.height} pixels, its photo "
+                f"{width} x {height}"
             )
     return landmark
 

@@ -162,15 +162,18 @@ class Field(nn.Module):
         """What is seen at placed samples: in the rays' appearance, in the other one, and of the transient field."""
         directions, inner = placed.directions, placed.inner
         level = Level(placed.t, placed.weights, *self.seen(inner, directions, codes.appearance))
-        other = transient = None
-        if (
-            codes.other is not None
-        ):  # released code of Ha-NeRF: colours and weights learn from it, the trunk's features not
+        other = None
+        if codes.other is not None:
+            # As in Ha-NeRF's released code, it teaches colours and weights, but not the trunk's output.
             other = Level(placed.t, placed.weights, *self.seen(inner.detach(), directions, codes.other))
-        if codes.transient is not None and self.transient is not None:
-            head = self.transient(inner, codes.transient[:, None])
-            transient = transient_samples(head, placed.density, placed.deltas)
+        transient = None if codes.transient is None else self.look_at_transients(placed, codes.transient)
         return March([*placed.before, level], placed.losses, other, transient)
+
+    def look_at_transients(self, placed: Placed, code: Tensor) -> TransientSamples | None:
+        """The transient field of the rays' photos, codes (R, TRANSIENT_CODE); None where there is no such field."""
+        if self.transient is None:
+            return None
+        return transient_samples(self.transient(placed.inner, code[:, None]), placed.density, placed.deltas)
 
 
 def append_one(x: Tensor) -> Tensor:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tiny_scene import write_tiny_scene
+from PIL import Image
+from tiny_scene import photo_names, write_tiny_scene
 
 from model.cameras import patch_grid
 from pipeline.batches import TrainingPhotos, as_tensor, jitter_colours
+from pipeline.errors import CrossrayError
 from pipeline.launch.tasks import in_process
 from pipeline.patches import Patch, PatchPlan
-from pipeline.photos import open_photos
+from pipeline.photos import Photos, open_photos
 from pipeline.shards import CameraRecord, cut_shards
 
 CPU = torch.device("cpu")
@@ -135,6 +137,70 @@ def test_photos_of_different_sizes_share_a_batch():
         torch.testing.assert_close(camera.fy * y / z + camera.cy, rows + 0.5, atol=1e-3, rtol=0)
         assert (batch.rays.near[here] == camera.near).all()
         assert (batch.rays.origins[here, 0] == patch.photo).all()
+
+
+# ------------------------------------------------------------------------------------------------------- masks
+
+
+def with_masks(folder, unmasked: tuple[int, ...] = ()) -> Photos:
+    """The tiny scene with a mask of all greys for every photo but the `unmasked` ones."""
+    root = write_tiny_scene(folder / "tiny", photos=6, size=(96, 72))
+    (root / "masks").mkdir()
+    for i, name in enumerate(photo_names(6)):
+        if i not in unmasked:
+            grey = np.random.default_rng(i).integers(0, 256, (72, 96), np.uint8)
+            Image.fromarray(grey).save(root / "masks" / name.replace(".jpg", ".png"))
+    cut_shards(root, folder / "shards", downscale=2, plan=PatchPlan(), mapper=in_process)
+    return open_photos(folder / "shards", folder / "cache")
+
+
+@pytest.fixture(scope="module")
+def masked(tmp_path_factory):
+    return with_masks(tmp_path_factory.mktemp("masked"))
+
+
+def test_masks_are_those_of_the_patches_pixels(masked):
+    batch = TrainingPhotos(masked, CPU, 0.5, masks=True).batch(PATCHES, K)
+    assert batch.masks.shape == (2, K * K)
+    assert batch.masks.dtype == torch.float32
+    for patch, scene_index, found in zip(PATCHES, (0, 4), batch.masks, strict=True):
+        rows, cols, _ = patch_grid(K, patch.scale, patch.offset_h, patch.offset_w, 36, 48)
+        mask = masked.mask(scene_index)
+        for value, row, col in zip(found.tolist(), rows.tolist(), cols.tolist(), strict=True):
+            assert value == pytest.approx(mask[row, col] / 255, abs=1e-7)
+    assert batch.masks.std() > 0.05  # greys stay greys
+
+
+def test_masks_come_only_where_they_are_asked_for(masked):
+    plain, fixed = (TrainingPhotos(masked, CPU, 0.5, masks=wanted).batch(PATCHES, K) for wanted in (False, True))
+    assert plain.masks is None
+    assert torch.equal(plain.colours, fixed.colours)
+    assert TrainingPhotos(masked, CPU, 0.5).batch(PATCHES, K).masks is None
+
+
+def test_colour_jitter_leaves_masks_alone(masked):
+    batch = TrainingPhotos(masked, CPU, 0.5, masks=True).batch(PATCHES, K)
+    assert jitter_colours(batch, 0.2, rng(1)).masks is batch.masks
+
+
+@pytest.mark.parametrize(
+    ("unmasked", "message"),
+    [
+        ((2,), r"model\.transient: fixed.* no mask of photo_002\.jpg; `crossray mask"),
+        ((0, 3, 4, 5), r"no mask of photo_000\.jpg and 2 more training photos; `crossray mask"),
+    ],
+    ids=["one", "three, and one that is not trained on"],
+)
+def test_training_photos_without_masks_are_named(tmp_path, unmasked, message):
+    photos = with_masks(tmp_path, unmasked)
+    TrainingPhotos(photos, CPU, 0.5)
+    with pytest.raises(CrossrayError, match=message):
+        TrainingPhotos(photos, CPU, 0.5, masks=True)
+
+
+def test_only_training_photos_need_masks(tmp_path):
+    batch = TrainingPhotos(with_masks(tmp_path, unmasked=(3,)), CPU, 0.5, masks=True).batch(PATCHES, K)
+    assert batch.masks is not None
 
 
 # ------------------------------------------------------------------------------------------------ colour jitter

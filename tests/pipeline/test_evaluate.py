@@ -15,9 +15,11 @@ from pipeline import evaluate as module
 from pipeline.checkpoint import CheckpointError
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import Judge, evaluate_run, fit_colours, load_run, parse_protocol
+from pipeline.fit import FitRecipe, fit_code
 from pipeline.launch.run import claim_run
 from pipeline.metrics import ssim_11, ssim_window3
 from pipeline.photos import open_photos
+from pipeline.render import render_picture
 from pipeline.train import Context, train
 
 STEP = "step-00000006"
@@ -25,12 +27,15 @@ STEP = "step-00000006"
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Finished runs on photos of 96 x 72 at R/2: `crossray` and `nerf`, six steps each."""
+    """Finished runs on photos of 49 x 36 at R/2: `crossray`, `nerf` and `nerfw`, six steps each."""
     folder = cut_tiny(tmp_path_factory.mktemp("evaluate"), size=(98, 72))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CROSSRAY_CACHE", str(folder / "cache"))
-        for method in ("crossray", "nerf"):
-            job = tiny_job(folder, method, {"name": method, "train": {"epochs": 1, "checkpoint_every": 3}})
+        for method in ("crossray", "nerf", "nerfw"):
+            over = {"name": method, "train": {"epochs": 1, "checkpoint_every": 3}}
+            if method == "nerfw":
+                over["model"] = {"field": "hash"}  # quick to fit codes of
+            job = tiny_job(folder, method, over)
             claim_run(job)
             train(job, Context())
     return folder
@@ -74,6 +79,20 @@ def test_a_protocol_is_named_with_its_downscale(name, appearance, ssim, downscal
     assert (found_downscale, found_affine) == (downscale, affine)
     assert (protocol.appearance, protocol.ssim) == (appearance, ssim)
     assert (protocol.scored, protocol.rounding, protocol.mlp_samples) == ("right", "truncate", (256, 256))
+
+
+def test_cross_scores_whole_clean_pictures():
+    protocol, downscale, affine = parse_protocol("cross@R1")
+    assert (downscale, affine) == (1, False)
+    assert (protocol.appearance, protocol.scored, protocol.truth) == ("elsewhere", "whole", "clean")
+    assert (protocol.ssim, protocol.rounding, protocol.mlp_samples) == ("window11", "round", (256, 256))
+
+
+def test_all_protocols_fit_codes_by_one_recipe():
+    """Codes are shared between protocols: for one photo and half there is one fit."""
+    first, *others = (parse_protocol(name)[0].fit for name in ("crnerf-full@R4", "nerfw-half@R1", "cross@R1"))
+    assert all(fit == first for fit in others)
+    assert first["mlp"] == FitRecipe(steps=1000, rays=1024, learning_rate=0.01)  # nerfbaselines' of NeRF-W
 
 
 @pytest.mark.parametrize(
@@ -231,6 +250,113 @@ def test_the_left_half_protocol_does_see_the_left_half(responsive, photos):
         predict(responsive, p, index, "nerfw-half@R2") for p in (photos, Doctored(photos, index, doctored))
     )
     assert np.abs(before - after).max() > 1e-3
+
+
+# Learned codes
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Protocols whose codes are fitted in a few steps, and what each fit was asked for: (image, camera, columns)."""
+    calls = []
+
+    def parse(name):
+        protocol, downscale, affine = parse_protocol(name)
+        quick = {"mlp": FitRecipe(steps=7, rays=64), "hash": FitRecipe(steps=5, rays=64)}
+        return protocol.model_copy(update={"fit": quick}), downscale, affine
+
+    def spy(model, image, camera, columns, recipe, **kwargs):
+        assert recipe.steps == 5  # that of the model's field
+        calls.append((image, camera, columns))
+        return fit_code(model, image, camera, columns, recipe, **kwargs)
+
+    monkeypatch.setattr(module, "parse_protocol", parse)
+    monkeypatch.setattr(module, "fit_code", spy)
+    return calls
+
+
+@pytest.mark.parametrize("name", ["crnerf-full@R2", "nerfw-half@R2"])
+def test_a_learned_code_is_fitted_to_the_left_half_and_metrics_say_so(run, photos, quick, name):
+    """Also where others read the whole photo: fitting to what is scored would be training on it."""
+    folder = run("nerfw")
+    result = evaluate_run(folder, name)
+    assert result["appearance_from"] == "left"
+    assert json.loads((folder / "eval" / name / STEP / "metrics.json").read_text())["appearance_from"] == "left"
+    (index,) = photos.indices("test")
+    ((image, camera, columns),) = quick
+    np.testing.assert_array_equal(image, photos.image(index))
+    assert camera == photos.records[index]
+    assert columns == 25  # of 49: the middle one is in both halves, as in nerfbaselines
+
+
+def test_what_others_read_from_is_said_too(run, quick):
+    for method, name, expected in (
+        ("crossray", "crnerf-full@R2", "whole"),
+        ("crossray", "nerfw-half@R2", "left"),
+        ("nerf", "crnerf-full@R2", "nothing"),
+        ("nerf", "nerfw-half@R2", "nothing"),
+    ):
+        folder = run(method)
+        assert evaluate_run(folder, name)["appearance_from"] == expected
+        shutil.rmtree(folder)
+    assert quick == []
+
+
+class DoctoredImage:
+    """Photos of which one has other pixels and another reference from a column on."""
+
+    def __init__(self, photos, index, column):
+        self.photos, self.index, self.column = photos, index, column
+
+    def __getattr__(self, name):
+        return getattr(self.photos, name)
+
+    def image(self, i):
+        image = self.photos.image(i).copy()
+        if i == self.index:
+            image[:, self.column :] = 255 - image[:, self.column :]
+        return image
+
+    def reference(self, i):
+        return 255 - self.photos.reference(i) if i == self.index else self.photos.reference(i)
+
+
+@pytest.mark.parametrize("name", ["crnerf-full@R2", "nerfw-half@R2"])
+def test_a_fitted_code_knows_nothing_of_the_right_half(trained, photos, quick, name):
+    _, model, _ = load_run(trained / "runs" / "nerfw")
+    (index,) = photos.indices("test")
+    protocol = module.parse_protocol(name)[0]
+    code, same, other = (
+        Judge(model, p, protocol, None).appearance(index)
+        for p in (photos, DoctoredImage(photos, index, 25), DoctoredImage(photos, index, 23))
+    )
+    assert torch.equal(code, same)
+    assert not torch.equal(code, other)
+
+
+def test_a_code_is_fitted_once_a_photo_and_checkpoint(run, quick, photos):
+    folder = run("nerfw")
+    (index,) = photos.indices("test")
+    codes = {}
+    first = evaluate_run(folder, "crnerf-full@R2", codes=codes)
+    assert codes.keys() == {(index, "left")}
+    shared = evaluate_run(folder, "nerfw-half@R2", codes=codes)
+    assert len(quick) == 1
+    assert evaluate_run(folder, "nerfw-half@R2")["images"] == shared["images"]  # fitted anew
+    assert len(quick) == 2
+    assert first["images"][0]["psnr"] == pytest.approx(shared["images"][0]["psnr"], abs=1e-9)  # one picture, two SSIMs
+
+
+def test_a_fitted_picture_is_what_is_scored(run, photos, quick):
+    folder = run("nerfw")
+    (row,) = evaluate_run(folder, "crnerf-full@R2")["images"]
+    _, model, _ = load_run(folder)
+    (index,) = photos.indices("test")
+    code = fit_code(model, photos.image(index), photos.records[index], 25, FitRecipe(steps=5, rays=64), seed=index)
+    picture = render_picture(model, photos.records[index], code)[1]
+    prediction, truth = by_hand(folder / "eval" / "crnerf-full@R2" / STEP, photos, index, 49 // 2)
+    np.testing.assert_array_equal(prediction, (255 * picture).astype(np.uint8)[:, 49 // 2 :])
+    assert row["psnr"] == pytest.approx(-10 * np.log10(np.square(prediction / 255 - truth / 255).mean()), abs=1e-9)
 
 
 # The affine control
