@@ -17,6 +17,7 @@ CODE = 48  # numbers in a photo's appearance code (NeRF-W's l_a; Ha-NeRF's)
 TRANSIENT_CODE = 16  # numbers in a photo's transient code (NeRF-W's l_tau)
 VIEW_CODE = 128  # numbers in a photo's code for its uv mask (Ha-NeRF)
 SMALLEST_SIDE = {"crossray": 8, "code": 16}  # pixels: released networks of this appearance read no smaller picture
+SMALLEST_SEGMENTED = 9  # pixels: at 8 CGNet's last stage is 1 x 1, of which BatchNorm can take no variance
 
 STRICT = {
     "extra": "forbid",
@@ -91,9 +92,10 @@ class ModelSpec:
     channels: int = 64
     """Channels of a feature (with colour `decoder`)."""
     encoder: Literal["released", "compact"] = "released"
-    """Networks that read a photo's appearance: the released code's, or small ones for small pictures."""
+    """Networks that read a photo's appearance, and the transform that goes with them: the released code's, or small
+    ones for small pictures."""
     transform: Literal["learned", "style_only", "mean_only", "closed_form"] = "learned"
-    """How `crossray` makes one appearance into another: `learned` as released; `style_only` without the second moment
+    """How `crossray` makes one appearance into another: `learned` from two second moments; `style_only` without the one
     over rays, `mean_only` without any, the controls for them; `closed_form` by Proposition 1, with nothing learned."""
     segmenter: Literal["cgnet", "unet"] = "cgnet"
     """Segmenter network: the released code's, or a small U-Net whose masks are as fine as its input."""
@@ -128,19 +130,20 @@ class Method:
 
 FAST = "the field, its recipe, and the small appearance networks and segmenter (model/appearance/compact.py)"
 POINTS = (
-    "statistics over all points of all rays, each counting alike; T at each point; D after volume rendering, so that "
-    "only the place of fusion and its statistics differ from crnerf"
+    "statistics over all points of all rays, each counting alike (at test: of a 32 x 32 grid of rays); T at each "
+    "point; D after volume rendering, so that only the place of fusion and its statistics differ from crnerf"
 )
 UNCERTAIN = (
     "the transient field gives features like the static one, composited with them before T and D; statistics come "
-    "from the static features alone, which are all that there is at test"
+    "from the static features alone, which are all that there is at test, and so do the appearance losses; densities "
+    "without noise, as in NeRF-W's code"
 )
 
 METHODS: dict[str, Method] = {
     "nerf": Method("mlp", "head", "none", "none", "none", "NeRF: table 1"),
     "nerfw": Method(
-        "mlp", "head", "embedding", "point", "uncertainty", "NeRF-W: table 1, as the re-implementation that it cites",
-        "at test the code is fitted to the photo's left half; the paper does not say how its rows were made",
+        "mlp", "head", "embedding", "point", "uncertainty", "NeRF-W: table 1, as in nerf_pl",
+        "how the paper's rows were made is not known; here, at test the code is fitted to the photo's left half",
     ),
     "hanerf": Method("mlp", "head", "code", "point", "uvmask", "Ha-NeRF: table 1"),
     "crnerf-b": Method("mlp", "decoder", "none", "none", "none", "CR-NeRF-B: ablation"),
@@ -161,6 +164,7 @@ METHODS: dict[str, Method] = {
 
 LEAST = {  # sizes below these have no meaning
     "channels": 1,
+    "pixel_center": 0,
     "mlp.width": 2,
     "mlp.coarse_samples": 4,
     "mlp.fine_samples": 1,
@@ -176,7 +180,16 @@ LEAST = {  # sizes below these have no meaning
 }
 
 
-MOST = {"hash.levels": 32, "hash.log2_entries": 24, "hash.max_resolution": 2**16, "channels": 4096, "mlp.width": 2**16}
+MOST = {
+    "hash.levels": 32,
+    "hash.log2_entries": 24,
+    "hash.max_resolution": 2**16,
+    "channels": 4096,
+    "mlp.width": 2**16,
+    "mlp.xyz_frequencies": 24,
+    "mlp.dir_frequencies": 24,
+    "pixel_center": 1,
+}
 
 
 def check_spec(spec: ModelSpec) -> None:
@@ -207,6 +220,12 @@ def check_spec(spec: ModelSpec) -> None:
 def smallest_side(spec: ModelSpec) -> int:
     """Pixels of the shorter side of the smallest picture whose appearance the model can read."""
     return SMALLEST_SIDE.get(spec.appearance, 1) if spec.encoder == "released" else 1
+
+
+def smallest_reference(spec: ModelSpec) -> int:
+    """Pixels of the shorter side of the smallest reference that the model can be trained with."""
+    segments = spec.transient == "segmenter" and spec.segmenter == "cgnet"
+    return max(smallest_side(spec), SMALLEST_SEGMENTED if segments else 1)
 
 
 def check_fusion(spec: ModelSpec) -> None:

@@ -58,15 +58,15 @@ class Batch(NamedTuple):
     colours: Tensor  # (P, N, 3) in [0, 1]
     positions: Tensor  # (P, N, 2): (x, y) of the pixel's middle in its photo, in (0, 1)
     photos: Tensor  # (P,) int64: which training photos
-    references: list[Tensor]  # P photos (3, h, w) in [0, 1], as the encoder and the segmenter see them
-    others: list[Tensor]  # P random other photos, for the appearance loss
+    references: list[Tensor]  # P photos (3, h, w) in [0, 1], as the encoder and the segmenter see them; or none
+    others: list[Tensor]  # P photos drawn at random, for the appearance loss and mode seeking
     masks: Tensor | None = None  # (P, N) transient probabilities of the data, for transient `fixed`
 
 
 class ColourMap(NamedTuple):
     """One appearance for one set of statistics: rgb = sigmoid(A F + b)."""
 
-    A: Tensor  # (P, 3, C)
+    A: Tensor  # (P, 3, C); fused at points (P, 3, C + 1), as F then has the sum of weights as one more channel
     b: Tensor  # (P, 3)
 
 
@@ -96,13 +96,14 @@ class SceneModel(nn.Module):
         self.spec = spec
         self.use_bfloat16 = False  # set by whoever runs the model on hardware where it pays
         self.coded = spec.appearance in ("embedding", "code")
+        self.fuses_points = spec.appearance == "crossray" and spec.fused == "point"
         head = spec.colour == "head"
         channels = 3 if head else spec.channels
         uncertain = spec.transient == "uncertainty"
         self.field: Field = (
-            HashField(spec.hash, channels, head, box, self.coded, uncertain)
+            HashField(spec.hash, channels, head, box, coded=self.coded, transient=uncertain)
             if spec.field == "hash"
-            else NeRFField(spec.mlp, channels, self.coded, uncertain)
+            else NeRFField(spec.mlp, channels, coded=self.coded, transient=uncertain)
         )
         self.decoder = None if head else AffineDecoder(channels)
         self.encoder: nn.Module | None = None
@@ -185,17 +186,15 @@ class SceneModel(nn.Module):
     def seen(self, level: Level, batch: Batch) -> Seen:
         """A level composited, with the statistics of its rays, or of its points where appearance is fused there."""
         patches = batch.colours.shape[:2]
-        if self.transform is None:
-            return Seen(self.rendered(level, patches), None)
-        if self.spec.fused == "point":
-            at_points = level.features.unflatten(0, patches).flatten(1, 2)
-            return Seen(self.rendered(level, patches), self.transform.content_statistics(at_points))
         features = self.rendered(level, patches)
-        return Seen(features, self.transform.content_statistics(features))
+        if self.transform is None:
+            return Seen(features, None)
+        of = level.features.unflatten(0, patches).flatten(1, 2) if self.fuses_points else features
+        return Seen(features, self.transform.content_statistics(of))
 
     def rendered(self, level: Level, patches: torch.Size) -> Tensor:
         """Features (P, N, C) of a level; fused at points, with the sum of weights as one more channel."""
-        if self.spec.fused == "point" and self.transform is not None:
+        if self.fuses_points:
             level = level.with_constant()
         return at_least_float32(level.composite().features).unflatten(0, patches)
 
@@ -245,7 +244,7 @@ class SceneModel(nn.Module):
         transient, level = march.transient, march.levels[-1]
         assert transient is not None
         patches = batch.colours.shape[:2]
-        if self.spec.fused == "point" and self.transform is not None:
+        if self.fuses_points:
             level, transient = level.with_constant(), transient.with_constant()
         both = at_least_float32(transient.composite(level)).unflatten(0, patches)
         picture = self.colours(both, appearance, static.content)
@@ -320,7 +319,7 @@ class SceneModel(nn.Module):
         assert self.transform is not None
         assert self.decoder is not None
         W, b = self.transform.affine(content, self.transform.style_statistics(appearance))
-        if self.spec.fused == "point":
+        if self.fuses_points:
             A, shift = self.decoder.fold(torch.cat([W, b[..., None]], dim=-1), torch.zeros_like(b))
             return ColourMap(A, shift)
         return ColourMap(*self.decoder.fold(W, b))
@@ -345,7 +344,7 @@ class SceneModel(nn.Module):
             if self.running_count == 0:
                 raise ValueError("statistics: running, but this model has not been trained")
             return ContentStatistics(self.running_mean, self.running_gram)
-        if self.spec.fused == "point":
+        if self.fuses_points:
             if points is None:
                 raise ValueError("statistics of points: the view has none")
             return self.transform.content_statistics(points[None])
@@ -401,7 +400,9 @@ class SceneModel(nn.Module):
             return None
         v, u = ((torch.arange(n, device=image.device) + 0.5) / n for n in size)
         uv = torch.stack(torch.meshgrid(v, u, indexing="ij"), dim=-1)
-        return self.uvmask(torch.tensor([photo], device=image.device), uv.view(1, -1, 2)).view(size)
+        number = torch.tensor([photo], device=image.device)
+        parts = uv.view(1, -1, 2).split(RENDER_POINTS, dim=1)
+        return torch.cat([self.uvmask(number, part) for part in parts], dim=1).view(size)
 
     # ----------------------------------------------------------------------------------------------- rendering
 
@@ -409,9 +410,9 @@ class SceneModel(nn.Module):
     def render(
         self, rays: Rays, chunk: int | None = None, samples: tuple[int, int] | None = None, code: Tensor | None = None
     ) -> Rendering:
-        """Features, depth and accumulation of R rays, `chunk` at a time; without a number, as many as RENDER_POINTS
-        allows. Beside the result, memory holds one chunk, whatever the view's size: an activation of the paper's MLP
-        is RENDER_POINTS x 256 floats (0.27 GB), and a few of them live at once.
+        """Features (R, C; C + 1 fused at points), depth and accumulation of R rays, `chunk` at a time, without a number
+        as many as RENDER_POINTS allows. Memory holds one chunk beside the result, whatever the view's size: an
+        activation of the paper's MLP is RENDER_POINTS x 256 floats (0.27 GB), and a few of them live at once.
 
         Args:
             code: (1, CODE) appearance, for a field that reads one.
@@ -419,7 +420,7 @@ class SceneModel(nn.Module):
         parts = []
         for march in self.marches(rays, chunk, samples, code):
             level = march.levels[-1]
-            if self.spec.fused == "point" and self.transform is not None:
+            if self.fuses_points:
                 level = level.with_constant()
             parts.append(Rendering(*(at_least_float32(x) for x in level.composite())))
         return Rendering(*(torch.cat(x) for x in zip(*parts, strict=True)))
@@ -438,7 +439,6 @@ class SceneModel(nn.Module):
         for part in self.chunks(rays, None, None):
             with self.autocast(rays.near.device):
                 found = self.field.look_at_transients(self.field.place(part), code.expand(len(part.near), -1))
-            assert found is not None
             parts.append(found.opacity())
         return torch.cat(parts)
 
@@ -451,7 +451,8 @@ class SceneModel(nn.Module):
         for part in self.chunks(rays, chunk, samples):
             codes = Codes(None if code is None else code.expand(len(part.near), -1))
             with self.autocast(rays.near.device):
-                yield self.field.march(part, samples=samples, codes=codes)
+                march = self.field.march(part, samples=samples, codes=codes)
+            yield march  # outside: a generator's context would stay open while its caller composites
 
     def chunks(self, rays: Rays, chunk: int | None, samples: tuple[int, int] | None) -> Iterator[Rays]:
         """The rays, `chunk` at a time, or as many as RENDER_POINTS allows."""
@@ -497,6 +498,11 @@ def part_of(name: str) -> str:
     if top in ("segmenter", "uvmask"):
         return "transient"
     return "field" if top in ("field", "decoder") else "appearance"
+
+
+def needs_references(spec: ModelSpec) -> bool:
+    """Whether a step looks at its photos as a whole."""
+    return spec.appearance in ("code", "crossray") or spec.transient == "segmenter"
 
 
 def needs_other(spec: ModelSpec, weights: LossWeights) -> bool:

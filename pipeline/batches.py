@@ -41,8 +41,10 @@ class TrainingPhotos:
         self.c2w = torch.tensor([r.c2w for r in records], device=device)
         self.bounds = torch.tensor([(r.near, r.far) for r in records], device=device)
 
-    def batch(self, patches: list[Patch], size: int, others: bool = True) -> Batch:
-        """The pixels of `patches`, each a size x size grid; the photos of the appearance loss only with `others`."""
+    def batch(self, patches: list[Patch], size: int, others: bool = True, references: bool = True) -> Batch:
+        """The pixels of `patches`, each a size x size grid; with `references` their photos as a whole, with `others`
+        the photos of the appearance loss.
+        """
         grids = [
             patch_grid(size, p.scale, p.offset_h, p.offset_w, *(int(n) for n in self.sizes[p.photo])) for p in patches
         ]
@@ -64,10 +66,10 @@ class TrainingPhotos:
         )
         near, far = self.bounds[chosen][:, None].expand(-1, rows.shape[1], -1).unbind(-1)
         rays = Rays(origins.flatten(0, 1), directions.flatten(0, 1), near.flatten(), far.flatten())
-        references = [self.reference(p.photo) for p in patches]
+        whole = [self.reference(p.photo) for p in patches] if references else []
         lent = [self.reference(p.other) for p in patches] if others else []
         photos = torch.tensor(chosen, device=self.device)
-        return Batch(rays, colours.to(self.device), positions.to(self.device), photos, references, lent, masks)
+        return Batch(rays, colours.to(self.device), positions.to(self.device), photos, whole, lent, masks)
 
     def pixels(self, photo: int, rows: Tensor, cols: Tensor) -> Tensor:
         """Colours (N, 3) in [0, 1] at rows and columns of one training photo."""
@@ -97,14 +99,15 @@ def check_masks(photos: Photos, indices: tuple[int, ...]) -> None:
 
 
 def check_references(photos: Photos, least: int) -> None:
-    """CrossrayError for a reference with a side under `least` pixels, which the appearance network cannot read."""
+    """CrossrayError for a reference with a side under `least` pixels, which the model's networks cannot read."""
     for i, record in enumerate(photos.records):
         height, width = photos.reference(i).shape[:2]
         if min(height, width) < least:
             factor = photos.manifest.reference_downscale
             raise CrossrayError(
-                f"scene.reference_downscale: {factor} makes {record.name} {width} x {height} pixels, and "
-                f"model.encoder: released reads no side under {least}; a smaller factor, or model.encoder: compact"
+                f"scene.reference_downscale: {factor} makes {record.name} {width} x {height} pixels, and the released "
+                f"networks read no side under {least}; a smaller factor, or model.encoder: compact and "
+                "model.segmenter: unet"
             )
 
 

@@ -211,7 +211,10 @@ def mask(
     print_line(
         f"{masked.folder}: {masked.photos} photos, {100 * masked.share:.2f} % masked on average; {masked.made} made now"
     )
-    print_line(f"crossray run jobs/train_scene.yaml --set scene.path={scene} --set method=crnerf-a-masks")
+    print_line(
+        f"crossray run jobs/train_scene_cpu.yaml --set scene.path={scene} --set name=fixed-masks "
+        "--set model.transient=fixed"
+    )
 
 
 @app.command()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from model.losses import PRESETS, LossWeights, check_weights
-from model.methods import FUSED_AT, METHODS, ModelSpec, check_spec, smallest_side
+from model.methods import AXES, FUSED_AT, METHODS, ModelSpec, check_spec, smallest_side
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.patches import PatchPlan
@@ -210,12 +211,12 @@ def load_job(path: Path, settings: Sequence[str] = ()) -> Job:
 def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "job") -> Job:
     """Like load_job, from a mapping."""
     for setting in settings:
-        raw = merge(raw, parse_setting(setting))
+        raw = merge(raw, new_setting(raw, parse_setting(setting), source))
     try:
         job = Job.model_validate(with_defaults(raw))
         check_spec(job.model)
         check_weights(job.losses)
-        check_patch(job)
+        check_training(job)
     except ValidationError as error:
         raise JobError("\n".join(f"{source}: {explain(e)}" for e in error.errors())) from None
     except ValueError as error:
@@ -223,8 +224,8 @@ def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "j
     return job
 
 
-def check_patch(job: Job) -> None:
-    """Refuse patches that the appearance losses cannot encode, and colours that nothing could explain."""
+def check_training(job: Job) -> None:
+    """Refuse patches that the appearance losses cannot encode, colours that nothing could explain, and free masks."""
     model, losses = job.model, job.losses
     least = smallest_side(model)
     compares_content = model.appearance == "crossray" and losses.content > 0
@@ -232,6 +233,11 @@ def check_patch(job: Job) -> None:
         raise ValueError(
             f"patch.size: {job.patch.size} is too small for the appearance losses with model.appearance: "
             f"{model.appearance} and model.encoder: released, which encode a rendered patch; at least {least}"
+        )
+    if model.transient in ("segmenter", "uvmask") and losses.mask_end == 0:
+        raise ValueError(
+            f"losses.mask_end: 0 makes masks free, and model.transient: {model.transient} would mask everything; the "
+            f"preset {losses.preset} has {PRESETS[losses.preset].get('mask_end', LossWeights.mask_end)}"
         )
     if job.train.colour_jitter > 0 and model.appearance in ("none", "embedding"):
         raise ValueError(
@@ -256,10 +262,9 @@ def with_defaults(raw: dict[str, Any]) -> dict[str, Any]:
         axes["fused"] = FUSED_AT.get(chosen["appearance"], "none")
     axes |= chosen
     recipe = merge(recipe_of(axes), {"model": axes})
-    preset = as_dict(raw.get("losses")).get("preset")
-    if preset is None:
-        preset = recipe.get("losses", {}).get("preset", "released")
-        return merge(merge({"losses": PRESETS[preset]}, recipe), raw)
+    preset, usual = as_dict(raw.get("losses")).get("preset"), recipe.get("losses", {}).get("preset", "released")
+    if preset is None or preset == usual:
+        return merge(merge({"losses": PRESETS[usual]}, recipe), raw)
     known = PRESETS.get(preset, {}) if isinstance(preset, str) else {}
     return merge(merge({**recipe, "losses": known}, {"losses": {"preset": preset}}), raw)
 
@@ -274,6 +279,22 @@ def recipe_of(axes: dict[str, str]) -> dict[str, Any]:
     if axes["field"] == "hash" and axes["transient"] == "uvmask":
         recipe = merge(recipe, UVMASK)
     return recipe
+
+
+def new_setting(raw: dict[str, Any], setting: dict[str, Any], source: str) -> dict[str, Any]:
+    """`setting`; JobError where it names a method or a preset, and `raw` spells out all that these stand for."""
+    every_axis = set(AXES) <= as_dict(raw.get("model")).keys()
+    every_weight = {field.name for field in fields(LossWeights)} <= as_dict(raw.get("losses")).keys()
+    spelt_out = {
+        "method": every_axis and "method" in setting,
+        "losses.preset": every_weight and "preset" in as_dict(setting.get("losses")),
+    }
+    for key in (key for key, there in spelt_out.items() if there):
+        raise JobError(
+            f"{source}: --set {key}=... would change the name alone: this file spells out all choices, as the job.yaml "
+            "of a run does; set it on the job file that the run was made from"
+        )
+    return setting
 
 
 def parse_setting(setting: str) -> dict[str, Any]:
@@ -316,6 +337,8 @@ def explain(error: Any) -> str:
         return f"{key}: there is no such key{nearest(location[-1], keys_at(location[:-1]))}"
     if error["type"] == "missing":
         return f"{key}: is missing"
+    if key == "kind":
+        return f"kind: {error['input']!r} is not known (valid: train, study)"
     return f"{key}: {error['msg'][:1].lower()}{error['msg'][1:]} (got {error['input']!r})"
 
 

@@ -53,7 +53,8 @@ LPIPS_SIDE = 31  # pixels; AlexNet has nothing left of a smaller picture
 AFFINE = "+affine"  # suffix of the control: colours fitted to the photo's left half by one affine map
 MASK_PHOTOS = 32  # training photos over which masks are compared with the truth, at most
 
-Codes = dict[tuple[int, str], torch.Tensor]  # (photo, what it was read from) -> appearance code that was fitted
+# Appearance codes that were fitted: of a checkpoint and a recipe, (photo, what it was read from) -> code.
+Codes = dict[tuple[str, FitRecipe], dict[tuple[int, str], torch.Tensor]]
 
 
 class Protocol(BaseModel):
@@ -119,8 +120,11 @@ def load_run(
                 f"{run}: no checkpoint of step {step}; there are {', '.join(map(str, steps)) or 'none'}"
             )
         checkpoint = read_checkpoint(run / "checkpoints" / folder_name(step))
+    torch.backends.cudnn.allow_tf32 = False  # as in training
     device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
     box = torch.zeros(2, 3)  # the scene's box is one of its buffers
+    if "photos" not in checkpoint.meta:
+        raise CheckpointError(f"{checkpoint.folder}: written by an older version of crossray; train the run again")
     model = SceneModel(job.model, box, checkpoint.meta["photos"]).to(device).requires_grad_(False)
     model.load_state_dict(checkpoint.model)
     return job, model.eval(), checkpoint
@@ -130,7 +134,7 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None, codes: 
     """Evaluate a run's checkpoint on its test photos; returns what metrics.json holds.
 
     Args:
-        codes: appearance codes fitted for another protocol of the same checkpoint; new ones are added.
+        codes: appearance codes fitted before, for other protocols; new ones are added.
 
     Raises:
         CrossrayError: the run, the protocol or the shards cannot be used.
@@ -140,12 +144,19 @@ def evaluate_run(run: Path, protocol_name: str, step: int | None = None, codes: 
     check_downscale(job, protocol_name, downscale)
     torch.set_num_threads(max(job.threads, torch.get_num_threads()))
     photos = open_photos(job.shards)
+    if photos.manifest.content_hash != checkpoint.meta["shards"]:
+        raise CrossrayError(
+            f"{job.shards}: other photos or masks than {run} was trained on; --set scene.shards=... in a new run, or "
+            "cut the shards again as they were"
+        )
     indices = photos.indices("test")
     if not indices:
         raise CrossrayError(f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table")
     out = run / "eval" / protocol_name / checkpoint.folder.name
     lpips = usable_lpips(photos, indices, protocol)
-    judge = Judge(model, photos, protocol, truth_of(job, photos) if protocol.truth == "clean" else None, codes)
+    judge = Judge(model, photos, protocol, truth_of(job, photos) if protocol.truth == "clean" else None)
+    if codes is not None:
+        judge.codes = codes.setdefault((checkpoint.meta["sha256"][MODEL], judge.recipe), judge.codes)
 
     began = time.perf_counter()
     progress = Progress(f"evaluating {run.name} under {protocol_name}")
@@ -184,19 +195,11 @@ class Judge:
 
     Args:
         landmark: the truth behind the photos, for a protocol that scores against it.
-        codes: appearance codes that are already fitted; new ones are added.
     """
 
-    def __init__(
-        self,
-        model: SceneModel,
-        photos: Photos,
-        protocol: Protocol,
-        landmark: Landmark | None,
-        codes: Codes | None = None,
-    ) -> None:
+    def __init__(self, model: SceneModel, photos: Photos, protocol: Protocol, landmark: Landmark | None) -> None:
         self.model, self.photos, self.protocol, self.landmark = model, photos, protocol, landmark
-        self.codes = {} if codes is None else codes
+        self.codes: dict[tuple[int, str], torch.Tensor] = {}  # (photo, what it was read from) -> fitted code
 
     @property
     def appearance_from(self) -> str:
@@ -214,6 +217,8 @@ class Judge:
 
     def appearance(self, index: int) -> torch.Tensor | None:
         """F^a of a test photo."""
+        if self.model.spec.appearance == "none":
+            return None
         source, image, reference = index, self.photos.image(index), self.photos.reference(index)
         if self.protocol.appearance == "elsewhere":
             source = elsewhere(self.photos, index)
@@ -258,8 +263,9 @@ class Judge:
         return {"name": name, "key": key, **score(prediction, truth, self.protocol, lpips, name)}
 
     def masks(self) -> dict[str, float]:
-        """Where the truth is known: how well the model's masks agree with it, on training photos."""
-        if self.landmark is None:
+        """Where the truth is known: how well the model's masks agree with it, on training photos. Masks that were
+        given to the model are none of its own."""
+        if self.landmark is None or self.model.spec.transient == "fixed":
             return {}
         train = self.photos.indices("train")
         iou = mask_iou(self.model, self.photos, self.landmark, train[:: -(-len(train) // MASK_PHOTOS)])

@@ -123,8 +123,10 @@ def make_masks(scene_root: Path, segmenter: Segmenter, *, replace: bool = False,
             f"{folder} cannot be written ({error.strerror}): masks lie beside the photos; copy the scene to where "
             "you can write"
         ) from error
-    with lock:
+    try:
         return _make(scene, folder, segmenter, described, replace, mapper)
+    finally:
+        lock.release()
 
 
 def _make(

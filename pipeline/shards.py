@@ -199,8 +199,10 @@ def cut_shards(
         lock.acquire()
     except OSError as error:
         raise ShardError(f"{out} cannot be written ({error.strerror}): choose another folder") from error
-    with lock:
+    try:
         return _cut(scene, out, downscale, reference_downscale, plan, mapper)
+    finally:
+        lock.release()
 
 
 def _cut(

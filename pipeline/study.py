@@ -40,9 +40,10 @@ from pipeline.config import (
 from pipeline.evaluate import recorded
 from pipeline.files import atomic_write
 from pipeline.published import Scores, published_tables
+from pipeline.shards import MANIFEST, read_manifest
 from pipeline.train import checkpoints
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=60)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=40)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 Keys = dict[str, Any]
 
@@ -55,6 +56,7 @@ TAKEN = {
     "patch.seed": "`seeds` of the study, or of the variant, says it",
 }
 
+RECORDED = ("definition", "samples", "appearance_from", "mean", "images", "seconds", "versions")  # of an evaluation
 METRICS = ("psnr", "ssim", "lpips")  # in this order, before all others
 BETTER = {"psnr": max, "ssim": max, "lpips": min, "mask_iou": max}  # others are shown, and nothing is called best
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 0, "steps": 0}  # others: 3
@@ -160,7 +162,17 @@ def make_study(raw: Keys, settings: Sequence[str] = (), source: str = "study") -
 
 
 def apply(raw: Keys, setting: Keys) -> Keys:
-    """`raw` with one setting on top: one of `base` wins over scenes and variants, and null leaves one of these out."""
+    """`raw` with one setting on top: one of `base` wins over scenes and variants, and null leaves one of these out.
+
+    Raises:
+        JobError: it leaves out what is not there, or adds a variant that says nothing of its model.
+    """
+    for part in ("variants", "scenes"):
+        there = list(as_dict(raw.get(part)))
+        for name, keys in as_dict(setting.get(part)).items():
+            means_new = isinstance(keys, dict) and (part == "scenes" or keys.keys() & {"method", "model"})
+            if name not in there and not means_new:
+                raise JobError(f"--set {part}.{name}: there is no such entry{nearest(name, there)}")
     raw = merge(raw, setting)
     if "base" in setting:
         raw["variants"] = {
@@ -237,6 +249,8 @@ def result_of(run: Run) -> Keys | None:
         return None
     if checkpoint is None or not checkpoint.meta["finished"] or training["steps"] != checkpoint.step:
         return None
+    if (job.shards / MANIFEST).is_file() and read_manifest(job.shards).content_hash != checkpoint.meta["shards"]:
+        return None  # trained on other photos or masks than there are now
     scores = {name: recorded(job.run, name, checkpoint) for name in job.evaluate.protocols}
     if any(score is None for score in scores.values()):
         return None
@@ -253,7 +267,7 @@ def result_of(run: Run) -> Keys | None:
         "checkpoint_sha256": checkpoint.meta["sha256"][MODEL],
         "source": json.loads(source.read_text()) if source.is_file() else None,
         "protocols": {
-            name: {key: score[key] for key in ("mean", "images", "seconds", "versions") if key in score}
+            name: {key: score[key] for key in RECORDED if key in score}
             for name, score in scores.items()
             if score is not None
         },

@@ -140,8 +140,10 @@ class TorchFile:
         storage, shape, stride, offset = stored.storage, stored.shape, stored.stride, stored.offset
         if not (is_sizes(shape) and is_sizes(stride) and is_sizes((offset,)) and len(shape) == len(stride)):
             raise TorchFileError(f"{self.source}: it describes a tensor with a shape or strides that are no numbers")
+        if 0 in shape:
+            raise TorchFileError(f"{self.source}: it describes a tensor of no numbers, {shape}; no network has one")
         last = offset + sum((n - 1) * step for n, step in zip(shape, stride, strict=True))
-        if math.prod(shape) > storage.length or (0 not in shape and last >= storage.length):
+        if math.prod(shape) > storage.length or last >= storage.length:
             raise TorchFileError(f"{self.source}: it describes a tensor {shape} beyond its {storage.length} numbers")
         if storage.key not in self.storages:
             self.storages[storage.key] = self.numbers(storage)

@@ -23,8 +23,8 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
-from model.methods import smallest_side
-from model.scene_model import Batch, SceneModel, needs_other
+from model.methods import smallest_reference
+from model.scene_model import Batch, SceneModel, needs_other, needs_references
 from pipeline.batches import TrainingPhotos, check_references, jitter_colours
 from pipeline.board import psnr_of, write_pictures, write_scalars
 from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
@@ -78,8 +78,9 @@ class Work:
 
     def batch(self, step: int) -> Batch:
         """The pixels, rays and references of these patches."""
-        others = needs_other(self.job.model, self.job.losses)
-        batch = self.data.batch(self.patches(step), self.job.patch.size, others)
+        model, size = self.job.model, self.job.patch.size
+        others, references = needs_other(model, self.job.losses), needs_references(model)
+        batch = self.data.batch(self.patches(step), size, others, references)
         strength = self.job.train.colour_jitter
         if strength == 0:
             return batch
@@ -132,8 +133,9 @@ def train(job: Job, context: Context) -> dict[str, Any]:
         TrainingError: a loss that is not a finite number, or a checkpoint that is not this run's.
     """
     torch.set_num_threads(job.threads)
+    torch.backends.cudnn.allow_tf32 = False  # float32 is float32; torch's default would round in convolutions
     photos = open_photos(job.shards)
-    check_references(photos, smallest_side(job.model))
+    check_references(photos, smallest_reference(job.model))
     data = TrainingPhotos(photos, context.device, job.model.pixel_center, masks=job.model.transient == "fixed")
     work = Work(job, context, data, epoch_length(job, data.sizes, context.world_size))
     model = build_model(job, photos, context.device)
@@ -207,7 +209,13 @@ def training_step(
     work: Work, ddp: torch.nn.Module, optimiser: torch.optim.Optimizer, step: int
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """One optimisation step; returns the loss terms and what is worth watching."""
-    terms, watched = forward(work, ddp, step)
+    try:
+        terms, watched = forward(work, ddp, step)
+    except (
+        ValueError,
+        torch.linalg.LinAlgError,
+    ) as error:  # a closed form cannot go on from numbers that are not finite
+        raise TrainingError(f"step {step}: {error}; the last good checkpoint is in {checkpoints(work.job)}") from error
     optimiser.zero_grad(set_to_none=True)
     torch.stack(list(terms.values())).sum().backward()
     optimiser.step()

@@ -19,8 +19,14 @@ def check_truth(job: Job) -> Landmark:
     """The landmark that a job's photos are of.
 
     Raises:
-        CrossrayError: the scene is another one or not at hand, or its photos were reduced.
+        CrossrayError: the scene is another one or not at hand, has one test photo alone, whose light could be read
+            from no other view, or its photos were reduced.
     """
+    if not job.scene.path.is_dir():
+        raise CrossrayError(
+            f"scene.path: {job.scene.path} is not there, and its truth is needed; `crossray landmark {job.scene.path}` "
+            "makes the built-in landmark"
+        )
     if not (job.scene.path / "truth" / "landmark.json").is_file():
         raise CrossrayError(
             f"scene.path: {job.scene.path} holds no truth; only the built-in landmark (`crossray landmark`) knows its "
@@ -31,21 +37,22 @@ def check_truth(job: Job) -> Landmark:
             f"scene.downscale: the landmark's truth is known at the size of its photos alone, and these are at "
             f"R{job.scene.downscale}; train with --set scene.downscale=1"
         )
-    return Landmark.read(job.scene.path)
+    landmark = Landmark.read(job.scene.path)
+    if len(landmark.names("test")) < 2:
+        raise CrossrayError(
+            f"scene.path: {job.scene.path} has one test photo; to read its light from elsewhere takes two at least"
+        )
+    return landmark
 
 
 def truth_of(job: Job, photos: Photos) -> Landmark:
     """The truth behind a job's photos.
 
     Raises:
-        CrossrayError: there is none (`check_truth`), it is of other photos, or there is one test photo alone, whose
-            light could be read from no other view.
+        CrossrayError: there is none (`check_truth`), or it is of other photos.
     """
     landmark = check_truth(job)
-    test = photos.indices("test")
-    if len(test) < 2:
-        raise CrossrayError(f"{job.scene.path}: one test photo; to read its light from elsewhere takes two at least")
-    for index in test:
+    for index in photos.indices("test"):
         name, (height, width) = photos.records[index].name, photos.image(index).shape[:2]
         camera = landmark.record(name).camera
         if (camera.height, camera.width) != (height, width):

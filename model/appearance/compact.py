@@ -1,4 +1,4 @@
-"""A small appearance branch for small pictures: bounded encoder, transform that starts as the identity.
+"""A small appearance branch for small pictures: bounded encoder, transform that starts near the identity.
 
 Same interface as the released one: T(F) = W F + b for each view, from explicit statistics. Two things differ, both from
 trouble seen with the released form on the fast field: embeddings pass through tanh, so that style cannot drown content,

@@ -21,7 +21,7 @@ class Rays(NamedTuple):
 
 
 class Codes(NamedTuple):
-    """What the photo of each ray is known by, at the points of a field; None where the field does not ask for it."""
+    """What the photo of each ray is known by; None where the field does not ask for it."""
 
     appearance: Tensor | None = None  # (R, CODE)
     other: Tensor | None = None  # (R, CODE): a second appearance, for losses only
@@ -166,13 +166,14 @@ class Field(nn.Module):
         if codes.other is not None:
             # As in Ha-NeRF's released code, it teaches colours and weights, but not the trunk's output.
             other = Level(placed.t, placed.weights, *self.seen(inner.detach(), directions, codes.other))
-        transient = None if codes.transient is None else self.look_at_transients(placed, codes.transient)
+        transient = None
+        if codes.transient is not None and self.transient is not None:
+            transient = self.look_at_transients(placed, codes.transient)
         return March([*placed.before, level], placed.losses, other, transient)
 
-    def look_at_transients(self, placed: Placed, code: Tensor) -> TransientSamples | None:
-        """The transient field of the rays' photos, codes (R, TRANSIENT_CODE); None where there is no such field."""
-        if self.transient is None:
-            return None
+    def look_at_transients(self, placed: Placed, code: Tensor) -> TransientSamples:
+        """The transient field of the rays' photos, codes (R, TRANSIENT_CODE)."""
+        assert self.transient is not None
         return transient_samples(self.transient(placed.inner, code[:, None]), placed.density, placed.deltas)
 
 

@@ -4,8 +4,8 @@ Space: points are put into the scene's box, [-1, 1] an axis, and what lies outsi
 [-2, 2], so a far background costs no more than the landmark. What a ray sees behind its last sample (sky) is a feature
 of its direction alone, and goes through compositing and decoding like any other sample.
 
-Where the field reads appearance codes, the trunk gives a bottleneck instead of features, and a second network makes
-features of bottleneck and code; the background reads the code, too.
+Where the field reads appearance codes or has a transient head, the trunk gives a bottleneck instead of features, and a
+second network makes features of bottleneck and code; the background reads the code, too.
 
 Notation: R rays, S samples a ray, edges e (R, S+1) with t at the middle of each interval.
 """
@@ -55,10 +55,12 @@ class HashField(Field):
         self.proposal_grid = HashEncoding(PROPOSAL_LEVELS, PROPOSAL_LOG2_ENTRIES, *PROPOSAL_RESOLUTION)
         self.proposal = mlp(self.proposal_grid.out_channels, 16, 1)
         self.grid = HashEncoding(spec.levels, spec.log2_entries, spec.min_resolution, spec.max_resolution)
-        inner = spec.width if coded else channels
+        apart = coded or transient  # what is known of a point is then not yet what is seen of it
+        inner = spec.width if apart else channels
         self.trunk = mlp(self.grid.out_channels, spec.width, 1 + inner)
         self.background = mlp(3 * (1 + 2 * DIRECTION_FREQUENCIES) + (CODE if coded else 0), 32, channels)
-        self.coloured = mlp(inner + CODE, spec.width, channels) if coded else None
+        self.coded = coded
+        self.coloured = mlp(inner + (CODE if coded else 0), spec.width, channels) if apart else None
         self.transient = (
             TransientHead(inner, channels, rgb, spec.width, TRANSIENT_DEPTH, TRANSIENT_BIAS) if transient else None
         )
@@ -88,11 +90,14 @@ class HashField(Field):
     def seen(self, inner: Tensor, directions: Tensor, code: Tensor | None) -> tuple[Tensor, Tensor]:
         """See Field."""
         looked = positional_encoding(directions, DIRECTION_FREQUENCIES)
-        if self.coloured is not None:
+        known = [inner]
+        if self.coded:
             if code is None:
                 raise ValueError("this field reads appearance codes, and none was given")
             looked = torch.cat([looked, code], dim=-1)
-            inner = self.coloured(torch.cat([inner, code[:, None].expand(-1, inner.shape[1], -1)], dim=-1))
+            known.append(code[:, None].expand(-1, inner.shape[1], -1))
+        if self.coloured is not None:
+            inner = self.coloured(torch.cat(known, dim=-1))
         background = self.background(looked)
         return self.activate(at_least_float32(inner)), self.activate(at_least_float32(background))
 

@@ -36,7 +36,7 @@ class NeRFField(Field):
         }
         self.coarse = RadianceMLP(channels, **sizes)
         self.fine = RadianceMLP(channels, **sizes, code_channels=CODE if coded else 0)
-        self.transient = TransientHead(spec.width, channels, rgb=True) if transient else None
+        self.transient = TransientHead(spec.width, channels, bounded=True) if transient else None
 
     def points_a_ray(self, samples: tuple[int, int] | None = None) -> int:
         """See Field: the fine MLP sees both kinds of samples."""

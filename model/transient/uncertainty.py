@@ -31,17 +31,17 @@ class TransientHead(nn.Module):
     Args:
         inputs: channels of what the field knows.
         channels: C of a feature.
-        rgb: features are colours, kept in (0, 1) by a sigmoid; without it they are free.
+        bounded: features are kept in (0, 1) by a sigmoid, as colours are; without it they are free.
         width, depth: of the hidden layers.
         density_bias: added before the softplus. At 0 (nerf_pl) untrained matter has a density of about 0.69 everywhere,
             which is fog in a scene of a few units, and a fast field learns to live with it before it has cleared.
     """
 
     def __init__(
-        self, inputs: int, channels: int, rgb: bool, width: int = 128, depth: int = 4, density_bias: float = 0.0
+        self, inputs: int, channels: int, bounded: bool, width: int = 128, depth: int = 4, density_bias: float = 0.0
     ) -> None:
         super().__init__()
-        self.rgb, self.density_bias = rgb, density_bias
+        self.bounded, self.density_bias = bounded, density_bias
         sizes = [inputs + TRANSIENT_CODE] + [width] * depth
         self.layers = nn.Sequential(*(part for pair in pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU())))
         self.density = nn.Linear(width, 1)
@@ -56,6 +56,6 @@ class TransientHead(nn.Module):
         features = self.features(h)
         return Transient(
             functional.softplus(self.density(h) + self.density_bias).squeeze(-1),
-            torch.sigmoid(features) if self.rgb else features,
+            torch.sigmoid(features) if self.bounded else features,
             functional.softplus(self.beta(h)).squeeze(-1),
         )

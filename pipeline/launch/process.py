@@ -94,7 +94,8 @@ def alone(spec: Spec) -> Iterator[int | None]:
 
 def environment(threads: int) -> dict[str, str]:
     """Of the process: this one's, without what Ray sets for its own workers. The GPUs that Ray has chosen stay."""
-    ours = {k: v for k, v in os.environ.items() if not k.startswith("RAY_") and k != "PYTHONBREAKPOINT"}
+    strange = ("PYTHONBREAKPOINT", "RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+    ours = {k: v for k, v in os.environ.items() if not k.startswith("RAY_") and k not in strange}
     return ours | {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", "COLUMNS": "200"}
 
 

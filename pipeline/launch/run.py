@@ -16,6 +16,7 @@ from pipeline.evaluate import check_protocols, run_protocols
 from pipeline.launch.local import run_local
 from pipeline.launch.tasks import ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
+from pipeline.masks import read_record
 from pipeline.progress import shown
 from pipeline.scene import Scene, read_scene
 from pipeline.shards import Manifest, cut_shards, mask_path, masks_hash, read_manifest, scene_record
@@ -106,6 +107,13 @@ def check_masks(job: Job, scene: Scene) -> None:
         raise CrossrayError(
             f"model.transient: fixed, but {scene.root / 'masks'} holds no mask of {without[0]}{more}; "
             f"`crossray mask {scene.root} --with ...` makes masks"
+        )
+    masks = [path for photo in scene.photos if (path := mask_path(scene, photo))]
+    segmenters = {record and record.segmenter for record in map(read_record, masks)}
+    if len(segmenters) > 1:
+        raise CrossrayError(
+            f"{scene.root / 'masks'} holds masks of {len(segmenters)} origins; `crossray mask` with --replace makes "
+            "all of them by one"
         )
 
 

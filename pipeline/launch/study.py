@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import logging
+import os
 import platform
 import signal
 import subprocess
@@ -45,29 +46,31 @@ def run_study(
         CrossrayError: anything that the user has to put right; no run has been started then.
         KeyboardInterrupt: the study was asked to stop; its runs have saved where they were.
     """
+    if "RANK" in os.environ:
+        raise CrossrayError("a study starts its runs itself; start it without torchrun")
     runs = expand(study)
+    for run in {(r.job.shards, r.job.scene, r.job.model.transient): r for r in reversed(runs)}.values():
+        with named(run):
+            check_protocols(run.job)
+            ensure_shards(run.job)
     for run in runs:
-        check(run)
+        if committed(checkpoints(run.job)):  # a run that never came so far may have been of a job put right since
+            with named(run):
+                claim_run(run.job)
     todo = [run for run in runs if result_of(run) is None]
     log.info("study %s: %d runs, %d of them done", study.name, len(runs), len(runs) - len(todo))
-    for run in {(r.job.shards, r.job.scene, r.job.model.transient): r for r in reversed(todo)}.values():
+    for run in todo:
         with named(run):
-            ensure_shards(run.job)
-    failures = run_all(study, todo, tasks) if todo else {}
-    results = [result for run in runs if (result := result_of(run)) is not None]
-    tables = make_tables(study, runs, results)
-    write_results(study, results, tables, failures)
+            check_protocols(run.job)
+            pick_device(run.job, run.job.ranks - 1)
+    failures: dict[str, str] = {}
+    try:
+        failures = run_all(study, todo, tasks) if todo else {}
+    finally:  # also when it was stopped: what is done counts
+        results = [result for run in runs if (result := result_of(run)) is not None]
+        tables = make_tables(study, runs, results)
+        write_results(study, results, tables, failures)
     return tables, failures
-
-
-def check(run: Run) -> None:
-    """CrossrayError for a run that could only be refused when it is started."""
-    job = run.job
-    with named(run):
-        check_protocols(job)
-        pick_device(job, job.ranks - 1)
-    if committed(checkpoints(job)):  # a run that never came so far may have been of a job that was put right since
-        claim_run(job)
 
 
 @contextmanager
@@ -85,7 +88,8 @@ def run_all(study: StudyJob, todo: list[Run], tasks: Callable[..., AbstractConte
     source = source_of_code()
     for run in todo:
         save_job(run.job, run.job.run / "job.yaml")
-        atomic_write(run.job.run / "source.json", source)
+        if not committed(checkpoints(run.job)):  # a run that goes on was started by what it says already
+            atomic_write(run.job.run / "source.json", source)
     log.info("%d to go; each writes to %s/<run>/log.txt", len(todo), study.folder)
     failures: dict[str, str] = {}
     stopped = False

@@ -68,7 +68,7 @@ def open_model(file: Path, quick: bool) -> Any:
     try:
         from ai_edge_litert.interpreter import Interpreter, OpResolverType
     except ImportError as error:
-        raise SegmenterError(f"tflite:FILE needs ai-edge-litert ({error}): pip install crossray[tflite]") from error
+        raise SegmenterError(f"tflite:FILE needs ai-edge-litert ({error}): pip install -e '.[tflite]'") from error
     if not file.is_file():
         raise SegmenterError(f"{file}: no such file; tflite:FILE names a TFLite model")
     kernels = OpResolverType.AUTO if quick else OpResolverType.BUILTIN_WITHOUT_DEFAULT_DELEGATES

@@ -14,7 +14,7 @@ from pipeline.files import sha256_of
 from pipeline.segmentation.base import SegmenterError, SegmenterRecord
 from pipeline.segmentation.classes import channels_of
 
-INSTALL = "pip install crossray[torchvision]"
+INSTALL = "pip install -e '.[torchvision]'"
 
 
 def import_torchvision() -> Any:

@@ -37,7 +37,7 @@ from model.transient.uvmask import UVMask
         (CGNet, CGNET),
         (ReleasedCode, CODE_NETWORK),
         (lambda: UVMask(photos=3).layers, UV_MASK),
-        (lambda: TransientHead(256, 3, rgb=True), TRANSIENT_HEAD),
+        (lambda: TransientHead(256, 3, bounded=True), TRANSIENT_HEAD),
     ],
 )
 def test_a_map_covers_its_module_and_loads(module, names):

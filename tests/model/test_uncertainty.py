@@ -32,11 +32,11 @@ def head(rgb: bool = True, **sizes: float) -> TransientHead:
 
 def test_the_head_has_the_size_of_nerf_pl_s():
     # (256 + 16) 128 + 128, three times 128^2 + 128, and 1 + 3 + 1 outputs of 128 + 1 each
-    assert sum(p.numel() for p in TransientHead(256, 3, rgb=True).parameters()) == 34_944 + 49_536 + 645
+    assert sum(p.numel() for p in TransientHead(256, 3, bounded=True).parameters()) == 34_944 + 49_536 + 645
 
 
 def test_one_unit_by_hand():
-    small = TransientHead(1, 2, rgb=False, width=1, depth=1)
+    small = TransientHead(1, 2, bounded=False, width=1, depth=1)
     for parameter in small.parameters():
         parameter.data.zero_()
     small.layers[0].weight.data[0, :3] = torch.tensor([2.0, 1.0, -1.0])  # the bottleneck, then the code
@@ -98,7 +98,7 @@ def test_golden_nerfw_heads(golden):
     vectors = golden("nerfw")
     weights = under(vectors, "param/")
     static = RadianceMLP(3, code_channels=CODE)
-    transient = TransientHead(256, 3, rgb=True)
+    transient = TransientHead(256, 3, bounded=True)
     for module, names in ((static, NERF_MLP), (transient, TRANSIENT_HEAD)):
         load_released(module, {name: value for name, value in weights.items() if name in names}, names)
     assert weights.keys() == NERF_MLP.keys() | TRANSIENT_HEAD.keys()

@@ -248,7 +248,7 @@ def test_a_network_without_a_class_is_refused(vision):
 @pytest.mark.parametrize("name", ["deeplabv3", "maskrcnn"])
 def test_without_torchvision_it_says_how_to_get_it(monkeypatch, name, root):
     monkeypatch.setitem(sys.modules, "torchvision", None)  # what an import of it meets where it is not installed
-    with pytest.raises(SegmenterError, match=re.escape("pip install crossray[torchvision]")):
+    with pytest.raises(SegmenterError, match=re.escape("pip install -e '.[torchvision]'")):
         make_masks(root, find_segmenter(name), mapper=in_process)
     assert not (root / "masks").exists()
 
@@ -429,7 +429,7 @@ def test_a_file_that_is_no_model(model):
 def test_without_litert_it_says_how_to_get_it(monkeypatch, model):
     monkeypatch.setitem(sys.modules, "ai_edge_litert", None)
     monkeypatch.delitem(sys.modules, "ai_edge_litert.interpreter")
-    with pytest.raises(SegmenterError, match=re.escape("pip install crossray[tflite]")):
+    with pytest.raises(SegmenterError, match=re.escape("pip install -e '.[tflite]'")):
         TFLite(model).describe(())
 
 

@@ -197,19 +197,12 @@ def test_elsewhere_is_the_next_test_photo_and_the_first_after_the_last():
     assert [elsewhere(Three(), i) for i in (3, 7, 9)] == [7, 9, 3]
 
 
-class OneTestPhoto(Doctored):
-    """Photos with the first test photo alone."""
-
-    def indices(self, split):
-        found = self.photos.indices(split)
-        return found[:1] if split == "test" else found
-
-
-def test_one_test_photo_alone_cannot_be_judged_by_cross(trained, responsive, photos):
-    alone = OneTestPhoto(photos, ())
-    (index,) = alone.indices("test")
-    with pytest.raises(CrossrayError, match="test photo"):
-        judge(responsive, alone, truth_of(landmark_job(trained), alone)).render(index)
+def test_one_test_photo_alone_cannot_be_judged_by_cross(trained, tmp_path):
+    write_landmark(tmp_path / "scene", train=8, val=1, test=1, size=16)
+    job = landmark_job(trained)
+    alone = job.model_copy(update={"scene": job.scene.model_copy(update={"path": tmp_path / "scene"})})
+    with pytest.raises(CrossrayError, match="one test photo"):
+        check_truth(alone)
 
 
 def test_the_affine_control_of_cross_is_refused(run):
