@@ -210,7 +210,6 @@ class SceneModel(nn.Module):
         """L_a (eq. 'transfer'): the appearance that was put in can be read again, and content stays; for codes, other
         codes give other pictures (Ha-NeRF).
         """
-        assert self.decoder is not None or self.coded
         terms = {}
         other_picture = None
         if other is not None:
