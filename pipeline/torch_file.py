@@ -141,7 +141,9 @@ class TorchFile:
         if not (is_sizes(shape) and is_sizes(stride) and is_sizes((offset,)) and len(shape) == len(stride)):
             raise TorchFileError(f"{self.source}: it describes a tensor with a shape or strides that are no numbers")
         if 0 in shape:
-            raise TorchFileError(f"{self.source}: it describes a tensor of no numbers, {shape}; no network has one")
+            if math.prod(n for n in shape if n) >= MOST_BYTES:
+                raise TorchFileError(f"{self.source}: it describes a tensor of an impossible shape, {shape}")
+            return torch.empty(shape, dtype=storage.dtype)
         last = offset + sum((n - 1) * step for n, step in zip(shape, stride, strict=True))
         if math.prod(shape) > storage.length or last >= storage.length:
             raise TorchFileError(f"{self.source}: it describes a tensor {shape} beyond its {storage.length} numbers")

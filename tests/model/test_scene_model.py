@@ -85,6 +85,18 @@ def test_bfloat16_changes_little_and_ends_in_float32(row):
     assert all(value.dtype == torch.float32 and value.isfinite() for value in terms.values())
 
 
+@pytest.mark.parametrize("row", ["crnerf", "crossray-fast"])
+def test_bfloat16_ends_at_the_field(row):
+    """Compositing is done in float32 also when a view is rendered."""
+    model, rays = small_model(row), small_rays(40)
+    model.use_bfloat16 = True
+    with torch.no_grad():
+        with model.autocast(rays.near.device):
+            level = model.field.march(rays).levels[-1]
+        expected = level.composite().features
+    assert torch.equal(model.render(rays).features, expected)
+
+
 # -------------------------------------------------------------------------------------------------- statistics
 
 

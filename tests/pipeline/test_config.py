@@ -406,6 +406,28 @@ def test_uv_masks_on_the_fast_field_are_trained_more_gently():
     assert job({"method": "hanerf"}).losses == LossWeights()
 
 
+@pytest.mark.parametrize("setting", ["method=nerf", "losses.preset=paper"])
+def test_a_resolved_job_keeps_its_method_and_preset(tmp_path, setting):
+    """It spells out every choice, so that only the name would change."""
+    save_job(job({"method": "crnerf"}), tmp_path / "job.yaml")
+    with pytest.raises(JobError, match=r"would change the name alone"):
+        load_job(tmp_path / "job.yaml", [setting])
+    assert load_job(tmp_path / "job.yaml", ["model.transient=none"]).model.transient == "none"
+
+
+@pytest.mark.parametrize("transient", ["segmenter", "uvmask"])
+def test_masks_that_cost_nothing_are_refused(transient):
+    with pytest.raises(JobError, match=r"losses\.mask_end: 0 makes masks free"):
+        job({"method": "crnerf", "model": {"transient": transient}, "losses": {"mask_end": 0.0}})
+    job({"method": "crnerf-a", "losses": {"mask_end": 0.0}})
+
+
+@pytest.mark.parametrize(("key", "value"), [("pixel_center", -5), ("pixel_center", 300), ("mlp.xyz_frequencies", 129)])
+def test_sizes_out_of_range_are_refused(key, value):
+    with pytest.raises(JobError, match=rf"model\.{key}: {value}"):
+        make_job({"name": "x", "scene": {"path": "."}}, [f"model.{key}={value}"])
+
+
 def test_masks_have_shards_of_their_own():
     plain, masked = (job({"method": method}) for method in ("crnerf-a", "crnerf-a-masks"))
     assert masked.shards.name == plain.shards.name + "-masks"

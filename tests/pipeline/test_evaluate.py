@@ -339,7 +339,8 @@ def test_a_code_is_fitted_once_a_photo_and_checkpoint(run, quick, photos):
     (index,) = photos.indices("test")
     codes = {}
     first = evaluate_run(folder, "crnerf-full@R2", codes=codes)
-    assert codes.keys() == {(index, "left")}
+    (fitted,) = codes.values()  # of one checkpoint and recipe
+    assert fitted.keys() == {(index, "left")}
     shared = evaluate_run(folder, "nerfw-half@R2", codes=codes)
     assert len(quick) == 1
     assert evaluate_run(folder, "nerfw-half@R2")["images"] == shared["images"]  # fitted anew

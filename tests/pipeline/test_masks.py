@@ -560,7 +560,7 @@ def test_the_command_masks_says_how_much_and_what_is_next(crossray, without_ray,
     assert line == f"{root}/masks: 10 photos, {100 * share:.2f} % masked on average; 10 made now"
     assert following.startswith("crossray run jobs/")
     assert f"--set scene.path={root}" in following
-    assert "--set method=crnerf-a-masks" in following
+    assert "--set model.transient=fixed" in following
     assert "0 made now" in crossray("mask", root, "--with", f"folder:{elsewhere}")[1]
 
 

@@ -59,7 +59,7 @@ def test_scores_follow_their_definitions(done):
     assert summary["psnr_floor"] == pytest.approx(np.mean(floors))
     nerf = [psnr(scored.nerf_picture(i), t) for i, t in zip(test, truths, strict=True)]
     assert summary["psnr_nerf"] == pytest.approx(np.mean(nerf))
-    predicted = np.concatenate([(scored.predicted_mask(i) > 0.5).ravel() for i in scored.photos.indices("train")])
+    predicted = np.concatenate([(scored.mask(i) > 0.5).ravel() for i in scored.photos.indices("train")])
     true = np.concatenate([scored.landmark.mask(scored.name(i)).ravel() for i in scored.photos.indices("train")])
     assert summary["mask_iou"] == pytest.approx((predicted & true).sum() / max(1, (predicted | true).sum()))
 

@@ -20,6 +20,7 @@ from tiny_scene import write_tiny_scene
 
 from pipeline import evaluate
 from pipeline import train as module
+from pipeline.batches import check_references
 from pipeline.checkpoint import committed, latest_checkpoint, read_checkpoint, save_checkpoint
 from pipeline.config import load_job, make_job, merge
 from pipeline.errors import CrossrayError
@@ -27,6 +28,7 @@ from pipeline.launch import run as launch
 from pipeline.launch.run import claim_run, ensure_shards, run_job
 from pipeline.launch.tasks import in_process
 from pipeline.launch.torchrun import pick_device, run_rank
+from pipeline.masks import MaskRecord, encode_mask
 from pipeline.photos import open_photos
 from pipeline.shards import cut_shards, verify_shards
 from pipeline.train import Context, TrainingError, checkpoints, train
@@ -490,6 +492,46 @@ def test_changed_masks_are_cut_into_the_shards_again(masked):
     assert len(cuts) == 2
     assert after.content_hash != before.content_hash
     np.testing.assert_array_equal(open_photos(job.shards).mask(0) > 127, (255 - mask)[::2, ::2] > 127)
+
+
+def test_masks_of_two_origins_are_refused(masked):
+    job, cuts = masked
+    record = MaskRecord(segmenter="0" * 64, photo="0" * 64, source=None, pixels="0" * 64, share=0.5)
+    (job.scene.path / "masks" / "photo_000.png").write_bytes(encode_mask(np.zeros((36, 48), np.uint8), record))
+    with pytest.raises(CrossrayError, match="masks of 2 origins"):
+        ensure_shards(job)
+    assert cuts == []
+
+
+def test_a_run_is_not_scored_on_masks_that_it_was_not_trained_on(masked):
+    job, _ = masked
+    ensure_shards(job)
+    claim_run(job)
+    train(job, Context())
+    evaluate.evaluate_run(job.run, "crnerf-full@R2")
+    Image.new("L", (48, 36), 255).save(job.scene.path / "masks" / "photo_000.png")
+    ensure_shards(job)
+    with pytest.raises(CrossrayError, match="other photos or masks than"):
+        evaluate.evaluate_run(job.run, "crnerf-full@R2")
+
+
+def test_numbers_that_a_closed_form_cannot_use_end_with_step_and_checkpoint(make, monkeypatch):
+    job = make("crossray", over={"model": {"transform": "closed_form"}})
+
+    def broken(*_):
+        raise ValueError("content_cov has values that are not finite")
+
+    monkeypatch.setattr(module, "forward", broken)
+    with pytest.raises(TrainingError, match=r"step 0: content_cov .*checkpoint"):
+        train(job, Context())
+
+
+def test_a_reference_that_is_too_small_is_named(make):
+    job = make("crnerf", over={"model": {"mlp": {"width": 16}}})
+    photos = open_photos(job.shards)
+    with pytest.raises(CrossrayError, match=r"scene\.reference_downscale: 1 makes photo_000\.jpg 48 x 36 .* under 37"):
+        check_references(photos, 37)
+    check_references(photos, 36)
 
 
 def test_a_missing_mask_is_named_before_anything_is_cut(masked):

@@ -12,6 +12,7 @@ from PIL import Image
 from tiny_run import tiny_job
 from tiny_scene import write_tiny_scene
 
+from model.methods import ModelSpec
 from pipeline import evaluate as module
 from pipeline import truth as truth_module
 from pipeline.errors import CrossrayError
@@ -304,6 +305,13 @@ def test_mask_iou_by_hand(monkeypatch):
     assert mask_iou(None, scene, scene, (0, 1)) is None
 
 
+class Masking:
+    """All that a judge of masks asks a model."""
+
+    def __init__(self, transient):
+        self.spec = ModelSpec(transient=transient)
+
+
 @pytest.mark.parametrize(("count", "step"), [(1, 1), (8, 1), (32, 1), (33, 2), (64, 2), (65, 3)])
 def test_masks_are_compared_on_up_to_32_training_photos(monkeypatch, count, step):
     class Many:
@@ -312,9 +320,10 @@ def test_masks_are_compared_on_up_to_32_training_photos(monkeypatch, count, step
 
     asked = []
     monkeypatch.setattr(module, "mask_iou", lambda model, photos, landmark, indices: asked.append(indices) or 0.25)
-    assert judge(None, Many(), landmark=object()).masks() == {"mask_iou": 0.25}
+    assert judge(Masking("segmenter"), Many(), landmark=object()).masks() == {"mask_iou": 0.25}
     assert asked == [tuple(range(100, 100 + count, step))]
-    assert judge(None, Many(), landmark=None).masks() == {}
+    assert judge(Masking("segmenter"), Many(), landmark=None).masks() == {}
+    assert judge(Masking("fixed"), Many(), landmark=object()).masks() == {}  # its masks were given to it
 
 
 @pytest.mark.parametrize("method", ROWS)
@@ -391,6 +400,6 @@ def test_an_evaluation_without_truth_says_so_too(run, trained):
     folder = run()
     path = folder / "job.yaml"
     path.write_text(path.read_text().replace(str(trained / "scene"), str(folder / "nowhere")))
-    with pytest.raises(CrossrayError, match="holds no truth"):
+    with pytest.raises(CrossrayError, match=r"nowhere is not there.*`crossray landmark"):
         evaluate_run(folder, "cross@R1")
     assert not (folder / "eval").exists()
