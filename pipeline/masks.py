@@ -303,8 +303,8 @@ def to_mask(probability: np.ndarray, photo_size: tuple[int, int]) -> np.ndarray:
     aspect: bilinear, its longer side that of the map or the photo's own, whichever is shorter.
     """
     long_side = max(photo_size)
-    scale = min(max(probability.shape), long_side) / long_side
-    width, height = (max(1, round(side * scale)) for side in photo_size)
+    longest = min(max(probability.shape), long_side)
+    width, height = (max(1, round(side * longest / long_side)) for side in photo_size)
     image = Image.fromarray(np.ascontiguousarray(probability, np.float32))
     if image.size != (width, height):
         image = image.resize((width, height), Image.Resampling.BILINEAR)

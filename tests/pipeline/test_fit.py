@@ -16,6 +16,8 @@ from pipeline.fit import FitRecipe, fit_code, rays_through
 from pipeline.render import render_picture, view_rays
 from pipeline.shards import CameraRecord
 
+pytestmark = pytest.mark.slow  # half a minute together: not for every commit
+
 CPU = torch.device("cpu")
 WIDTH, LEFT = 24, 12
 PHOTOS = 5

@@ -29,6 +29,8 @@ from pipeline.shards import cut_shards
 from pipeline.train import Context, train
 from pipeline.truth import check_truth, elsewhere, mask_iou, reduced, truth_of
 
+pytestmark = pytest.mark.slow  # half a minute together: not for every commit
+
 STEP = "step-00000002"
 ROWS = ("crossray", "nerf", "nerfw")
 
