@@ -30,6 +30,8 @@ from pipeline.segmentation import Segmenter, SegmenterError, SegmenterRecord, fi
 from pipeline.segmentation.tflite import TFLite
 from pipeline.shards import cut_shards, mask_path, read_manifest, read_shard
 
+pytestmark = pytest.mark.slow  # a quarter of a minute together: not for every commit
+
 PHOTOS = 10
 SIZE = (48, 36)
 
