@@ -25,7 +25,8 @@ from pipeline.patches import PatchPlan
 UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 # Keys of `train` that decide what is kept and shown, not what is learned: they may change between two starts of a run.
-BOOKKEEPING = ("checkpoint_every", "keep_checkpoints", "log_every", "picture_every")
+# So may what a person changes to go on after something broke: the resumed run says what is then not exact.
+BOOKKEEPING = ("checkpoint_every", "keep_checkpoints", "log_every", "picture_every", "skip_steps", "any_ranks")
 
 
 class JobError(CrossrayError):
@@ -104,6 +105,12 @@ class TrainJob(Section):
     """Steps between TensorBoard scalars."""
     picture_every: int = Field(2000, ge=1)
     """Steps between TensorBoard pictures of the fixed validation view."""
+    skip_steps: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Steps that are left out: how a run goes on past a step whose loss was not a finite number."""
+    any_ranks: bool = False
+    """Allow to go on from a checkpoint of another number of ranks: each step then sees another number of rays."""
+    deterministic: bool = False
+    """On GPUs: only algorithms that give the same bits each time. Slower; not yet measured. On CPU it is always so."""
 
 
 class EvaluateJob(Section):
@@ -111,6 +118,21 @@ class EvaluateJob(Section):
 
     protocols: tuple[str, ...] = ()
     """Protocols to evaluate under, each with its downscale: `crnerf-full@R4`."""
+    each_checkpoint: bool = False
+    """Launcher `ray`: evaluate each checkpoint while training goes on, on what the ranks leave free of the cluster."""
+    gpus: float = Field(0.25, gt=0, le=1)
+    """Share of a GPU that an evaluation task takes, where the job trains on GPUs."""
+
+
+class RayJob(Section):
+    """Where the Ray launcher puts the ranks, and how often it starts them again."""
+
+    cpus_per_rank: int | None = Field(None, ge=1)
+    """CPUs that a rank reserves; by default as many as its `threads`."""
+    placement: Literal["PACK", "SPREAD", "STRICT_PACK", "STRICT_SPREAD"] = "PACK"
+    """Ray's placement strategy: ranks on few nodes, or on many."""
+    max_failures: int = Field(3, ge=-1)
+    """How often the ranks are started again after one of them, or a node, is lost; -1: without end."""
 
 
 class Job(Section):
@@ -128,8 +150,10 @@ class Job(Section):
     """Folder of all runs."""
     ranks: int = Field(1, ge=1)
     """Processes that train together: one a GPU, or one a CPU core."""
-    launcher: Literal["local", "torchrun"] = "local"
-    """`local`: starts the ranks on this machine. `torchrun`: torchrun has started them."""
+    launcher: Literal["auto", "local", "torchrun", "ray"] = "auto"
+    """`local`: starts the ranks on this machine. `torchrun`: torchrun has started them. `ray`: Ray Train starts them on
+    a cluster. `auto`: torchrun where its variables are set, else ray in a submitted job or where RAY_ADDRESS names a
+    cluster, else local."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """`auto`: CUDA where there is a GPU."""
     threads: int = Field(1, ge=1, le=1024)
@@ -144,6 +168,8 @@ class Job(Section):
     """How long, how fast, and what is kept."""
     evaluate: EvaluateJob = EvaluateJob()
     """What happens after training."""
+    ray: RayJob = RayJob()
+    """Launcher `ray`: where the ranks go."""
 
     @property
     def run(self) -> Path:

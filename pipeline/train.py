@@ -54,6 +54,10 @@ class Context:
     world_size: int = 1
     device: torch.device = torch.device("cpu")
     should_stop: Callable[[], bool] = lambda: False
+    watch: Callable[[dict[str, float]], None] = lambda numbers: None
+    """Takes speed and loss every `log_every` steps, on rank 0 alone."""
+    report: Callable[[dict[str, float]], None] = lambda numbers: None
+    """Takes the same after a checkpoint, on all ranks in the same step; it may cost seconds, so it is called rarely."""
 
 
 @dataclass(frozen=True)

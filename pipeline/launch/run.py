@@ -24,7 +24,7 @@ from pipeline.shards import Manifest, cut_shards, mask_path, masks_hash, read_ma
 log = logging.getLogger("crossray")
 
 # Keys that may change between two starts of one run: they decide where and when, not what comes out.
-FREE_KEYS = ("launcher", "device", "threads", "runs", "evaluate", *(f"train.{key}" for key in BOOKKEEPING))
+FREE_KEYS = ("launcher", "device", "threads", "runs", "evaluate", "ray", *(f"train.{key}" for key in BOOKKEEPING))
 
 
 def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -37,17 +37,27 @@ def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         CrossrayError: anything that the user has to put right.
     """
     check_protocols(job)
-    if job.launcher == "local":
+    launcher = launcher_of(job)
+    if launcher == "local":
         pick_device(job, job.ranks - 1)  # a job that wants more than there is says so before anything is started
     ensure_shards(job)
     claim_run(job)
-    if job.launcher == "torchrun":
+    if launcher == "torchrun":
         trained = run_rank(job)
         if int(os.environ["RANK"]) != 0:
             return trained, []
     else:
         trained = run_local(job)
     return trained, run_protocols(job) if trained["finished"] else []
+
+
+def launcher_of(job: Job) -> str:
+    """Who starts the ranks: what the job says; `auto` is decided by what is around this process."""
+    if job.launcher != "auto":
+        return job.launcher
+    if "RANK" in os.environ:
+        return "torchrun"
+    return "ray" if os.environ.get("RAY_ADDRESS") else "local"
 
 
 def claim_run(job: Job) -> None:
