@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,8 @@ os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 torch.set_num_threads(1)
+
+sys.path.append(str(Path(__file__).parent / "pipeline"))  # tiny_run and tiny_scene, for the faults as well
 
 ROOT = Path(__file__).resolve().parent.parent
 TEST_DATA = Path(os.environ.get("CROSSRAY_TEST_DATA", ROOT.parent / "shared" / "data")).resolve()
