@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import math
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -11,15 +14,44 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from model.scene_model import SceneModel
+from pipeline.metrics import psnr_of
 from pipeline.photos import Photos
 from pipeline.render import colour_view, predicted_mask, render_view, training_appearance
+
+log = logging.getLogger("crossray")
 
 PICTURE_SIDE = 160  # pictures are rendered at about this many pixels a side
 
 
-def psnr_of(mse: Tensor | float) -> float:
-    """-10 log10 of a mean squared error."""
-    return -10 * math.log10(max(float(mse), 1e-10))
+class Board:
+    """A run's TensorBoard; what an earlier start wrote after `step` is hidden.
+
+    A disk that is full takes no step from the training: it costs curves until there is room again.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        self.folder = folder
+        self.purge_from: int | None = step + 1
+        self.writer: SummaryWriter | None = None
+
+    def write(self, what: Callable[..., None], step: int, *args: Any) -> None:
+        """`what(writer, step, *args)`."""
+        try:
+            if self.writer is None:
+                self.writer = SummaryWriter(str(self.folder), purge_step=self.purge_from)
+                self.purge_from = None
+            what(self.writer, step, *args)
+        except OSError as error:
+            log.warning("%s: step %d cannot be written (%s)", self.folder, step, error)
+            self.writer = None  # its thread has ended with the error
+
+    def close(self) -> None:
+        """Everything is in the file when this returns."""
+        try:
+            if self.writer is not None:
+                self.writer.close()
+        except OSError as error:
+            log.warning("%s: the last steps cannot be written (%s)", self.folder, error)
 
 
 def write_scalars(
@@ -28,18 +60,20 @@ def write_scalars(
     terms: dict[str, Tensor],
     watched: dict[str, Tensor],
     optimiser: torch.optim.Optimizer,
-    rays_per_second: float,
+    numbers: dict[str, float],
 ) -> None:
     """Every loss term, what is watched, speed, learning rates, memory."""
     for name, value in terms.items():
         writer.add_scalar(f"loss/{name}", float(value), step)
-    writer.add_scalar("loss/total", float(sum(terms.values())), step)
-    writer.add_scalar("train/psnr", psnr_of(watched["mse"]), step)
+    writer.add_scalar("loss/total", numbers["loss"], step)
+    writer.add_scalar("train/psnr", numbers["psnr"], step)
+    writer.add_scalar("train/gradient_norm", float(watched["gradient_norm"]), step)
     if "mask" in watched:
         writer.add_scalar("train/mask_share", float(watched["mask"]), step)
     for group in optimiser.param_groups:
         writer.add_scalar(f"learning_rate/{group['part']}", group["lr"], step)
-    writer.add_scalar("speed/rays_per_second", rays_per_second, step)
+    for name in ("rays_per_second", "step_seconds", "checkpoint_seconds"):
+        writer.add_scalar(f"speed/{name}", numbers[name], step)
     writer.add_scalar("memory/resident_MiB", psutil.Process().memory_info().rss / 2**20, step)
     if torch.cuda.is_available():
         writer.add_scalar("memory/gpu_peak_MiB", torch.cuda.max_memory_allocated() / 2**20, step)

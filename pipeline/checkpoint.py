@@ -29,7 +29,7 @@ from pipeline.files import atomic_write, sha256_of
 
 log = logging.getLogger("crossray")
 
-FORMAT = 1
+FORMAT = 2
 MODEL, TRAINING, META = "model.safetensors", "training.pt", "meta.json"
 
 

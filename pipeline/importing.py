@@ -93,6 +93,7 @@ def import_checkpoint(file: Path, job: Job) -> Path:
         "seconds": 0.0,
         "finished": True,
         "world_size": job.ranks,
+        "skipped": [],
         "photos": len(photos.indices("train")),
     }
     optimiser = build_optimiser(model, job.train).state_dict()

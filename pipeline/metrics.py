@@ -7,7 +7,8 @@ released evaluation scores an 8-bit prediction against a float truth). Everythin
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from typing import Literal, SupportsFloat
 
 import numpy as np
 from scipy import ndimage
@@ -26,6 +27,11 @@ def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
     prediction, truth = _pair(prediction, truth, window=1)
     error = np.mean((prediction - truth) ** 2)
     return float("inf") if error == 0 else float(-10 * np.log10(error))
+
+
+def psnr_of(mse: SupportsFloat) -> float:
+    """-10 log10 of a mean squared error, in dB; at most 100."""
+    return -10 * math.log10(max(float(mse), 1e-10))
 
 
 def ssim_window3(prediction: np.ndarray, truth: np.ndarray) -> float:

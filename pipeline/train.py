@@ -6,126 +6,39 @@ and resumed anywhere. DDP averages gradients over the ranks; rank 0 alone writes
 
 from __future__ import annotations
 
-import hashlib
 import json
-import logging
 import math
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import torch.distributed as dist
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
-from torch.utils.tensorboard import SummaryWriter
+from torch.nn.utils import get_total_norm
 
 from model.methods import smallest_reference
-from model.scene_model import Batch, SceneModel, needs_other, needs_references
-from pipeline.batches import TrainingPhotos, check_references, jitter_colours
-from pipeline.board import psnr_of, write_pictures, write_scalars
-from pipeline.checkpoint import latest_checkpoint, prune, save_checkpoint
-from pipeline.config import BOOKKEEPING, Job, TrainJob
-from pipeline.errors import CrossrayError
+from model.scene_model import SceneModel
+from pipeline.batches import TrainingPhotos, check_references
+from pipeline.board import Board, write_pictures, write_scalars
+from pipeline.clock import Clock, Speed
+from pipeline.config import Job, TrainJob
 from pipeline.files import atomic_write
-from pipeline.patches import Patch, patches, step_generator, steps_per_epoch
+from pipeline.heartbeat import Heartbeat, rank_path
+from pipeline.patches import steps_per_epoch
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
+from pipeline.record import GRADIENT, LossRecord, record_path
+from pipeline.resume import TrainingError, checkpoints, own_run, resume, run_identity
+from pipeline.together import agree, broken_step, check_finite, control_group, save
+from pipeline.work import Context, Work
 
-log = logging.getLogger("crossray")
+__all__ = ["Context", "TrainingError", "Work", "checkpoints", "train"]
 
-JITTER = 4  # keeps these draws apart from those of the patches
-AGREE_EVERY = 10  # steps between the moments at which all ranks agree on time and on stopping
-SLOW_STEP = 1.0  # seconds; steps longer than this end with an agreement each, so that a stop is heard in time
-
-
-class TrainingError(CrossrayError):
-    """Training cannot go on."""
-
-
-@dataclass(frozen=True)
-class Context:
-    """What a launcher tells a rank; the process group, if there are several ranks, is already there."""
-
-    rank: int = 0
-    world_size: int = 1
-    device: torch.device = torch.device("cpu")
-    should_stop: Callable[[], bool] = lambda: False
-    watch: Callable[[dict[str, float]], None] = lambda numbers: None
-    """Takes speed and loss every `log_every` steps, on rank 0 alone."""
-    report: Callable[[dict[str, float]], None] = lambda numbers: None
-    """Takes the same after a checkpoint, on all ranks in the same step; it may cost seconds, so it is called rarely."""
-
-
-@dataclass(frozen=True)
-class Work:
-    """What a rank does in each step: fixed for the whole run, and a pure function of the step."""
-
-    job: Job
-    context: Context
-    data: TrainingPhotos
-    steps_per_epoch: int
-
-    def patches(self, step: int) -> list[Patch]:
-        """Which patches this rank sees in a step."""
-        return patches(
-            self.job.patch,
-            self.data.sizes,
-            step=step,
-            rank=self.context.rank,
-            world_size=self.context.world_size,
-            steps_per_epoch=self.steps_per_epoch,
-        )
-
-    def batch(self, step: int) -> Batch:
-        """The pixels, rays and references of these patches."""
-        model, size = self.job.model, self.job.patch.size
-        others, references = needs_other(model, self.job.losses), needs_references(model)
-        batch = self.data.batch(self.patches(step), size, others, references)
-        strength = self.job.train.colour_jitter
-        if strength == 0:
-            return batch
-        return jitter_colours(batch, strength, np.random.default_rng((JITTER, self.seed, step, self.context.rank)))
-
-    def generator(self, step: int) -> torch.Generator:
-        """The source of everything else that is drawn in a step."""
-        return step_generator(self.seed, step, self.context.rank, self.context.device)
-
-    @property
-    def seed(self) -> int:
-        """Of everything that is drawn."""
-        return self.job.patch.seed
-
-    @property
-    def rays_a_step(self) -> int:
-        """Over all ranks."""
-        return self.job.patch.photos * self.job.patch.size**2 * self.context.world_size
-
-
-@dataclass
-class Clock:
-    """How far training is: by steps, or by seconds where the job gives seconds."""
-
-    total_steps: int | None
-    total_seconds: float | None
-    step: int = 0
-    seconds: float = 0.0
-
-    @property
-    def progress(self) -> float:
-        """Share of the training that is done, in [0, 1]."""
-        if self.total_seconds is not None:
-            return min(self.seconds / self.total_seconds, 1.0)
-        assert self.total_steps is not None
-        return self.step / self.total_steps
-
-    @property
-    def done(self) -> bool:
-        """Whether no step is left."""
-        return self.progress >= 1
+LOOK_EVERY = 10  # steps between the moments at which losses are read from the device
+REPORT_EVERY = 60.0  # seconds between two reports to the launcher, at least
 
 
 def train(job: Job, context: Context) -> dict[str, Any]:
@@ -134,10 +47,16 @@ def train(job: Job, context: Context) -> dict[str, Any]:
     Resumes from the run's newest whole checkpoint.
 
     Raises:
-        TrainingError: a loss that is not a finite number, or a checkpoint that is not this run's.
+        TrainingError: a loss that is not a finite number, a checkpoint that is not this run's, or another process that
+            trains this run.
     """
-    torch.set_num_threads(job.threads)
-    torch.backends.cudnn.allow_tf32 = False  # float32 is float32; torch's default would round in convolutions
+    with own_run(job) if context.rank == 0 else nullcontext():
+        return train_owned(job, context)
+
+
+def train_owned(job: Job, context: Context) -> dict[str, Any]:
+    """Like `train`, of a run that nobody else trains."""
+    set_up_torch(job, context.device)
     photos = open_photos(job.shards)
     check_references(photos, smallest_reference(job.model))
     data = TrainingPhotos(photos, context.device, job.model.pixel_center, masks=job.model.transient == "fixed")
@@ -148,54 +67,63 @@ def train(job: Job, context: Context) -> dict[str, Any]:
     clock = Clock(None if seconds else job.train.epochs * work.steps_per_epoch, seconds)
     identity = run_identity(job, photos)
     ddp = distribute(model, context)
+    together = control_group(context)
     if context.world_size > 2:
         warm_up(work, ddp)
-    resume(job, identity, model, optimiser, clock, context)
+    skipped = set(resume(job, identity, model, optimiser, clock, context.world_size))
 
     lead = context.rank == 0
-    writer = SummaryWriter(str(job.run / "tensorboard"), purge_step=clock.step + 1) if lead else None
+    record = LossRecord(record_path(job.run, context.rank), clock.step)
+    heartbeat = Heartbeat(rank_path(job.run, context.rank))
+    board = Board(job.run / "tensorboard", clock.step)
     progress = Progress(f"training {job.name}", clock.progress, enabled=lead)
-    last_saved, stopped, slow = clock.step, False, False
-    last_log = (clock.step, time.perf_counter())
-    started = time.perf_counter() - clock.seconds
-    while not clock.done:
-        set_learning_rates(optimiser, job.train, clock)
-        terms, watched = training_step(work, ddp, optimiser, clock.step)
+    speed = Speed(clock, work.rays_a_step)
+    terms: dict[str, Tensor] = {}
+    watched: dict[str, Tensor] = {}
+    reported, ends = clock.seconds, clock.done
+    while not ends:
+        if clock.step in job.train.skip_steps:
+            record.leave_out()
+            skipped.add(clock.step)
+        else:
+            set_learning_rates(optimiser, job.train, clock)
+            terms, watched = training_step(work, ddp, optimiser, clock.step, record)
         clock.step += 1
+        stopped, clock.seconds = agree(together, context, speed.seconds())
 
-        if slow or clock.step % AGREE_EVERY == 0 or clock.total_steps == clock.step:
-            stopped, clock.seconds = agree(context, time.perf_counter() - started)
-            slow = clock.seconds / clock.step > SLOW_STEP
-            progress.update(clock.progress, f"step {clock.step}  PSNR {psnr_of(watched['mse']):.1f}")
-        save_now = clock.done or stopped or clock.step % job.train.checkpoint_every == 0
-        log_now = clock.done or clock.step % job.train.log_every == 0
-        if save_now or log_now:
-            check_finite(work, terms, model, clock.step - 1)
-        if writer is not None and log_now:
-            rate = (clock.step - last_log[0]) * work.rays_a_step / (time.perf_counter() - last_log[1])
-            write_scalars(writer, clock.step, terms, watched, optimiser, rate)
-            last_log = (clock.step, time.perf_counter())
+        ends = clock.done or stopped
+        save_now = ends or clock.step % job.train.checkpoint_every == 0
+        log_now = (clock.done or clock.step % job.train.log_every == 0) and bool(terms)
+        if save_now or log_now or clock.step % LOOK_EVERY == 0:
+            check_finite(work, together, record, model if save_now else None)
+            progress.update(clock.progress, f"step {clock.step}  loss {float(sum(terms.values())):.4f}")
+        if heartbeat.due():
+            heartbeat.beat("training", ranks=context.world_size, **speed.facts())
+        if log_now and lead:
+            numbers = speed.numbers(terms, watched)
+            board.write(write_scalars, clock.step, terms, watched, optimiser, numbers)
+            context.watch(numbers)
         if save_now:
-            if lead and clock.step != last_saved:
-                meta = identity | {
-                    "seconds": clock.seconds,
-                    "finished": clock.done,
-                    "world_size": context.world_size,
-                    "photos": len(data.index),
-                }
-                save_checkpoint(checkpoints(job), clock.step, model.state_dict(), optimiser.state_dict(), meta)
-                prune(checkpoints(job), job.train.keep_checkpoints)
-            last_saved = clock.step
-        if writer is not None and (clock.step % job.train.picture_every == 0 or clock.done):
-            write_pictures(writer, clock.step, model, photos)  # after saving: nothing that it meets can lose a step
-        if stopped:
-            break
+            meta = identity | {
+                "seconds": clock.seconds,
+                "finished": clock.done,
+                "world_size": context.world_size,
+                "photos": len(data.index),
+                "skipped": sorted(skipped),
+            }
+            save(work, together, record, speed, model, optimiser, meta, last=ends)
+            if terms and (ends or clock.seconds - reported >= REPORT_EVERY):
+                reported = clock.seconds
+                context.report(speed.numbers(terms, watched))
+        if lead and (clock.step % job.train.picture_every == 0 or clock.done):
+            board.write(write_pictures, clock.step, model, photos)  # after saving: nothing that it meets loses a step
     progress.close()
-    if writer is not None:
-        writer.close()
+    board.close()
+    heartbeat.beat("trained" if clock.done else "stopped", ranks=context.world_size, **speed.facts())
     result = {
         "steps": clock.step,
         "train_seconds": clock.seconds,
+        "checkpoint_seconds": speed.all_checkpoint_seconds,
         "ranks": context.world_size,
         "finished": clock.done,
         "steps_per_epoch": work.steps_per_epoch,
@@ -210,20 +138,28 @@ def train(job: Job, context: Context) -> dict[str, Any]:
 
 
 def training_step(
-    work: Work, ddp: torch.nn.Module, optimiser: torch.optim.Optimizer, step: int
+    work: Work, ddp: torch.nn.Module, optimiser: torch.optim.Optimizer, step: int, record: LossRecord
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """One optimisation step; returns the loss terms and what is worth watching."""
     try:
         terms, watched = forward(work, ddp, step)
-    except (
-        ValueError,
-        torch.linalg.LinAlgError,
-    ) as error:  # a closed form cannot go on from numbers that are not finite
-        raise TrainingError(f"step {step}: {error}; the last good checkpoint is in {checkpoints(work.job)}") from error
+    except (ValueError, torch.linalg.LinAlgError) as error:  # a closed form refuses numbers that are not finite
+        bad = record.look()
+        raise broken_step(work, bad.step if bad else step, [work.context.rank], str(error)) from error
     optimiser.zero_grad(set_to_none=True)
     torch.stack(list(terms.values())).sum().backward()
+    terms = {name: value.detach() for name, value in terms.items()}
+    watched["gradient_norm"] = gradient_norm(optimiser)
+    record.add(terms | {GRADIENT: watched["gradient_norm"]})
     optimiser.step()
-    return {k: v.detach() for k, v in terms.items()}, watched
+    return terms, watched
+
+
+def gradient_norm(optimiser: torch.optim.Optimizer) -> Tensor:
+    """Norm of the gradient of all networks. Hash tables are left out: they are large, and their gradient comes through
+    a network, so what is not finite there is not finite here."""
+    groups = (group["params"] for group in optimiser.param_groups if group["part"] != "grid")
+    return get_total_norm([p.grad for group in groups for p in group if p.grad is not None])
 
 
 def forward(work: Work, ddp: torch.nn.Module, step: int) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -232,6 +168,16 @@ def forward(work: Work, ddp: torch.nn.Module, step: int) -> tuple[dict[str, Tens
 
 
 # ------------------------------------------------------------------------------------------------------ set-up
+
+
+def set_up_torch(job: Job, device: torch.device) -> None:
+    """Threads, and how exact float32 is."""
+    torch.set_num_threads(job.threads)
+    torch.backends.cudnn.allow_tf32 = False  # float32 is float32; torch's default would round in convolutions
+    if job.train.deterministic and device.type == "cuda":
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True)
+        torch.backends.cudnn.benchmark = False
 
 
 def build_model(job: Job, photos: Photos, device: torch.device) -> SceneModel:
@@ -294,53 +240,6 @@ def uses_bfloat16(job: Job, device: torch.device) -> bool:
     return job.model.field == "mlp" and bool(torch.cpu._is_avx512_bf16_supported())
 
 
-# ------------------------------------------------------------------------------------------------------ resume
-
-
-def checkpoints(job: Job) -> Path:
-    """The folder of the run's checkpoints."""
-    return job.run / "checkpoints"
-
-
-def run_identity(job: Job, photos: Photos) -> dict[str, str]:
-    """What must agree for a checkpoint to be this run's: the photos, and all of the job that enters the result."""
-    relevant = job.model_dump(
-        mode="json", include={"method", "model", "patch", "losses", "train"}, exclude={"train": set(BOOKKEEPING)}
-    )
-    text = json.dumps(relevant, sort_keys=True)
-    return {"shards": photos.manifest.content_hash, "job": hashlib.sha256(text.encode()).hexdigest()}
-
-
-def resume(
-    job: Job,
-    identity: dict[str, str],
-    model: SceneModel,
-    optimiser: torch.optim.Optimizer,
-    clock: Clock,
-    context: Context,
-) -> None:
-    """Go on from the run's newest whole checkpoint, if there is one.
-
-    Raises:
-        TrainingError: the checkpoint belongs to other photos, another job, or another number of ranks.
-    """
-    checkpoint = latest_checkpoint(checkpoints(job))
-    if checkpoint is None:
-        return
-    expected = identity | {"world_size": context.world_size}
-    differs = [key for key, value in expected.items() if checkpoint.meta.get(key) != value]
-    if differs:
-        raise TrainingError(
-            f"{checkpoint.folder} was written with other {' and '.join(differs)}: it cannot be gone on from. "
-            f"Choose another name (--set name=...), or remove {job.run}"
-        )
-    model.load_state_dict(checkpoint.model)
-    optimiser.load_state_dict(checkpoint.optimiser())
-    clock.step, clock.seconds = checkpoint.step, float(checkpoint.meta["seconds"])
-    if context.rank == 0:
-        log.info("resuming %s from step %d", job.name, clock.step)
-
-
 # ---------------------------------------------------------------------------------------------------- schedule
 
 
@@ -359,29 +258,6 @@ def learning_rate(base: float, train_job: TrainJob, step: int, progress: float) 
         return low + (rate - low) * 0.5 * (1 + math.cos(math.pi * epoch / train_job.epochs))
     late = max(0.0, (progress - train_job.decay_from) / (1 - train_job.decay_from))
     return rate * train_job.decay_floor**late
-
-
-def agree(context: Context, seconds: float) -> tuple[bool, float]:
-    """All ranks take rank 0's clock, and stop if any of them was asked to."""
-    if context.world_size == 1:
-        return context.should_stop(), seconds
-    shared = torch.tensor([float(context.should_stop()), seconds if context.rank == 0 else 0.0], dtype=torch.float64)
-    shared = shared.to(context.device)
-    dist.all_reduce(shared)
-    return bool(shared[0] > 0), float(shared[1])
-
-
-def check_finite(work: Work, terms: dict[str, Tensor], model: SceneModel, step: int) -> None:
-    """Stop before numbers that are not finite reach a checkpoint."""
-    bad = [f"the loss {name}" for name, value in terms.items() if not math.isfinite(float(value))]
-    bad += [f"the weights {name}" for name, value in model.named_parameters() if not bool(value.isfinite().all())][:3]
-    if bad:
-        records = work.data.photos.records
-        names = sorted({records[work.data.index[p.photo]].name for p in work.patches(step)})
-        raise TrainingError(
-            f"step {step}: {', '.join(bad)} not finite (this rank's photos in this step: {', '.join(names)}). "
-            f"The last good checkpoint is in {checkpoints(work.job)}; a lower learning rate is the usual cure"
-        )
 
 
 def device_name(device: torch.device) -> str:

@@ -210,7 +210,7 @@ def test_any_other_meta_is_a_checkpoint_error(saved, content):
         {"step": "many"},
         {"step": None},
         {"step": float("inf")},
-        {"format": 2},
+        {"format": 3},
         {"format": None},
         {"sha256": {}},
         {"sha256": None},

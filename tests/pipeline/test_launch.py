@@ -22,11 +22,12 @@ from pipeline.config import Job, save_job
 from pipeline.errors import CrossrayError
 from pipeline.launch.local import run_local
 from pipeline.launch.run import claim_run
-from pipeline.train import AGREE_EVERY, checkpoints
+from pipeline.train import checkpoints
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = 100
-FIRST = Path(f"step-{AGREE_EVERY:08d}") / "meta.json"  # of the first checkpoint
+EVERY = 10  # steps between checkpoints
+FIRST = Path(f"step-{EVERY:08d}") / "meta.json"  # of the first checkpoint
 PATIENCE = 100.0  # seconds until a test gives a process up
 
 
@@ -43,7 +44,7 @@ def _environment(cut, monkeypatch):
 
 
 def two_ranks(cut: Path, name: str, **train) -> Job:
-    train = {"epochs": 2, "steps_per_epoch": STEPS // 2, "checkpoint_every": AGREE_EVERY} | train
+    train = {"epochs": 2, "steps_per_epoch": STEPS // 2, "checkpoint_every": EVERY} | train
     return tiny_job(cut, "crossray", {"name": name, "ranks": 2, "patch": {"size": 4}, "train": train})
 
 
@@ -99,10 +100,9 @@ def interrupt_once_there(process: subprocess.Popen, path: Path, ctrl_c: bool = F
 
 
 def assert_stopped_on_the_way(job: Job) -> int:
-    """The newest checkpoint is whole, and of a step at which the ranks agreed; returns the step."""
+    """The newest checkpoint is whole, and of a step on the way, which is returned."""
     newest = read_checkpoint(committed(checkpoints(job))[-1])
-    assert AGREE_EVERY <= newest.step < STEPS
-    assert newest.step % AGREE_EVERY == 0
+    assert EVERY <= newest.step < STEPS
     assert newest.meta["finished"] is False
     assert newest.meta["world_size"] == 2
     return newest.step
@@ -164,14 +164,14 @@ def test_sigterm_to_one_rank_stops_it_and_gives_the_signal_back(cut, monkeypatch
     job = tiny_job(cut, "nerf", {"name": "alone", "train": {"epochs": 4}})
     step = train_module.training_step
 
-    def interrupted(work, ddp, optimiser, number):
+    def interrupted(work, ddp, optimiser, number, record):
         if number == 3:
             signal.raise_signal(signal.SIGTERM)
-        return step(work, ddp, optimiser, number)
+        return step(work, ddp, optimiser, number, record)
 
     monkeypatch.setattr(train_module, "training_step", interrupted)
     before = signal.getsignal(signal.SIGTERM)
     result = run_local(job)
     assert signal.getsignal(signal.SIGTERM) is before
-    assert (result["steps"], result["finished"]) == (AGREE_EVERY, False)
-    assert [p.name for p in committed(checkpoints(job))] == ["step-00000010"]
+    assert (result["steps"], result["finished"]) == (4, False)
+    assert [p.name for p in committed(checkpoints(job))] == ["step-00000004"]

@@ -6,9 +6,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from datetime import timedelta
 from functools import cache
+from itertools import count
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from model.methods import METHODS
 from model.scene_model import SceneModel, part_of
 from pipeline import evaluate as evaluate_module
 from pipeline import train as train_module
+from pipeline import work as work_module
 from pipeline.checkpoint import committed
 from pipeline.config import Job
 from pipeline.evaluate import evaluate_run, load_run, parse_protocol
@@ -57,7 +61,6 @@ def cut(tmp_path_factory):
 def _environment(cut):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CROSSRAY_CACHE", str(cut / "cache"))
-        patch.setattr(train_module, "AGREE_EVERY", STOP)
         patch.setattr(evaluate_module, "find_lpips", lambda: None)
         patch.setattr(evaluate_module, "parse_protocol", quick_protocol)
         yield
@@ -146,9 +149,8 @@ def test_a_row_renders_a_training_photo_and_its_mask_where_it_has_one(straight, 
 
 def walk(folder: str) -> dict[str, str]:
     """Entry point of a rank. Returns, of rank 0, what is wrong with each row: "" where all is well."""
-    train_module.AGREE_EVERY = STOP
     torch.set_num_threads(1)
-    made = {name: keep(name) for name in ("build_model", "patches")}
+    made = {"build_model": keep(train_module, "build_model"), "patches": keep(work_module, "patches")}
     dist.init_process_group("gloo", timeout=timedelta(seconds=60))  # ranks that wait for each other end it
     rank, wrong = dist.get_rank(), {}
     try:
@@ -158,8 +160,8 @@ def walk(folder: str) -> dict[str, str]:
                 assert train(straight, Context(rank, 2))["finished"]
                 ranks: list = [None, None]
                 dist.all_gather_object(ranks, (made["patches"][-1], digest(made["build_model"][-1])))
-                asked = rank == 1  # one rank is asked, both stop
-                assert not train(stopped, Context(rank, 2, should_stop=lambda asked=asked: asked))["finished"]
+                asked = asked_in(STOP) if rank == 1 else (lambda: False)  # one rank is asked, both stop
+                assert not train(stopped, Context(rank, 2, should_stop=asked))["finished"]
                 dist.barrier()  # a checkpoint is rank 0's to write, and everybody's to read
                 assert train(stopped, Context(rank, 2))["steps"] == STEPS
                 dist.barrier()
@@ -172,16 +174,22 @@ def walk(folder: str) -> dict[str, str]:
     return wrong
 
 
-def keep(name: str) -> list:
-    """Everything that a function of pipeline.train returns from now on."""
+def asked_in(step: int) -> Callable[[], bool]:
+    """A launcher that asks to stop in the step number `step`."""
+    calls = count(1)
+    return lambda: next(calls) >= step
+
+
+def keep(module: ModuleType, name: str) -> list:
+    """Everything that a function of a module returns from now on."""
     kept: list = []
-    original = getattr(train_module, name)
+    original = getattr(module, name)
 
     def spy(*args, **kwargs):
         kept.append(original(*args, **kwargs))
         return kept[-1]
 
-    setattr(train_module, name, spy)
+    setattr(module, name, spy)
     return kept
 
 

@@ -11,7 +11,6 @@ from PIL import Image
 from tiny_scene import write_tiny_scene
 
 from model.methods import METHODS
-from pipeline import train as train_module
 from pipeline.checkpoint import latest_checkpoint
 from pipeline.config import Job, make_job, merge
 from pipeline.launch.tasks import in_process
@@ -97,13 +96,13 @@ def tiny_photos(folder: Path) -> Photos:
 
 
 def train_until(job: Job, step: int) -> dict[str, Any]:
-    """Train as one rank; the launcher asks to stop at the first agreement from `step` (a multiple of it) on."""
+    """Train as one rank; the launcher asks to stop in the step number `step` of this start."""
     asked = 0
 
-    def should_stop() -> bool:  # called at every agreement
+    def should_stop() -> bool:  # called once a step
         nonlocal asked
         asked += 1
-        return asked * train_module.AGREE_EVERY >= step
+        return asked >= step
 
     return train(job, Context(should_stop=should_stop))
 

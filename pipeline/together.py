@@ -1,0 +1,125 @@
+"""What the ranks of a run do together beside averaging gradients: agree on time and on stopping, find a step with
+numbers that are not finite, and save."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from model.scene_model import SceneModel
+from pipeline.checkpoint import committed, prune, save_checkpoint
+from pipeline.clock import Speed
+from pipeline.record import GRADIENT, LossRecord
+from pipeline.resume import TrainingError, checkpoints
+from pipeline.work import Context, Work
+
+log = logging.getLogger("crossray")
+
+
+def control_group(context: Context) -> dist.ProcessGroup | None:
+    """Where the ranks agree on small things without waiting for their GPUs; None: the default group."""
+    return dist.new_group(backend="gloo") if context.world_size > 1 and context.device.type == "cuda" else None
+
+
+def agree(together: dist.ProcessGroup | None, context: Context, seconds: float) -> tuple[bool, float]:
+    """All ranks take rank 0's clock, and stop if any of them was asked to."""
+    if context.world_size == 1:
+        return context.should_stop(), seconds
+    shared = torch.tensor([float(context.should_stop()), seconds if context.rank == 0 else 0.0], dtype=torch.float64)
+    dist.all_reduce(shared, group=together)
+    return bool(shared[0] > 0), float(shared[1])
+
+
+def save(
+    work: Work,
+    together: dist.ProcessGroup | None,
+    record: LossRecord,
+    speed: Speed,
+    model: SceneModel,
+    optimiser: torch.optim.Optimizer,
+    meta: dict[str, Any],
+    last: bool,
+) -> None:
+    """Every rank's losses, then the checkpoint.
+
+    Raises:
+        TrainingError: the `last` one cannot be written. An earlier one that cannot be is only missed.
+    """
+    began, job, step = time.perf_counter(), work.job, speed.clock.step
+    folder, problem = checkpoints(job), attempt(record.save)
+    if work.context.world_size > 1:
+        dist.barrier(together)
+    if work.context.rank == 0:
+        state = model.state_dict(), optimiser.state_dict()
+        problem = problem or attempt(lambda: save_checkpoint(folder, step, *state, meta))
+    if problem and last:
+        raise TrainingError(
+            f"step {step} cannot be saved: {problem}. Earlier checkpoints in {folder} are whole: make room, and run "
+            "the same command again"
+        )
+    if problem:
+        log.error("step %d cannot be saved: %s; training goes on and tries again at the next checkpoint", step, problem)
+    elif work.context.rank == 0:
+        prune(folder, job.train.keep_checkpoints)
+    speed.wait(time.perf_counter() - began)
+
+
+def attempt(action: Callable[[], object]) -> OSError | None:
+    """Do it; the error where the disk does not let us."""
+    try:
+        action()
+    except OSError as error:
+        return error
+    return None
+
+
+def check_finite(
+    work: Work, together: dist.ProcessGroup | None, record: LossRecord, model: SceneModel | None = None
+) -> None:
+    """Stop before numbers that are not finite reach a checkpoint; all ranks stop with the same words.
+
+    Args:
+        model: its weights are looked at, too.
+    """
+    bad, context = record.look(), work.context
+    found = torch.zeros(context.world_size, 2, dtype=torch.float64)  # a row a rank: step, which numbers as bits
+    wrong = sum(1 << record.names.index(name) for name in bad.names) if bad else 0
+    found[context.rank] = torch.tensor([bad.step if bad else torch.inf, wrong])
+    if context.world_size > 1:
+        dist.all_reduce(found, group=together)
+    step = float(found[:, 0].min())
+    if step < torch.inf:
+        bits = [(rank, int(found[rank, 1])) for rank in range(context.world_size) if found[rank, 0] == step]
+        of_losses = (1 << record.names.index(GRADIENT)) - 1  # the gradient is the last, and that of all ranks
+        ranks = [rank for rank, wrong in bits if wrong & of_losses] or [rank for rank, _ in bits]
+        names = [n for i, n in enumerate(record.names[:-1]) if any(wrong >> i & 1 for _, wrong in bits)]
+        what = f"the loss {', '.join(names)}" if names else "the gradient"
+        raise broken_step(work, int(step), ranks, f"{what} is not finite")
+    names = [name for name, value in model.named_parameters() if not bool(value.isfinite().all())] if model else []
+    if names:
+        raise broken_step(work, record.step - 1, [], f"the weights {', '.join(names[:3])} are not finite")
+
+
+def broken_step(work: Work, step: int, ranks: list[int], problem: str) -> TrainingError:
+    """The error that says what is wrong with a step, on which photos, and how to go on.
+
+    Args:
+        ranks: whose photos; none: nobody's in particular.
+    """
+    records = work.data.photos.records
+    drawn = (p for rank in ranks for p in work.patches(step, rank))
+    names = sorted({records[work.data.index[p.photo]].name for p in drawn})
+    whose = f"rank {ranks[0]}" if len(ranks) == 1 else "all ranks"
+    photos = f" (photos of {whose} in this step: {', '.join(names)})" if names else ""
+    good = committed(checkpoints(work.job))
+    last = f"the last good checkpoint is {good[-1]}" if good else "there is no checkpoint yet"
+    skip = [*work.job.train.skip_steps, step]
+    return TrainingError(
+        f"step {step}: {problem}{photos}; {last}. A lower learning rate is the usual cure; "
+        f"--set 'train.skip_steps={skip}' goes on without this step"
+    )
