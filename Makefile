@@ -1,5 +1,6 @@
 # make quickstart   the whole pipeline on the built-in landmark (about 5 minutes on 2 cores)
 # make test         everything that a machine without a cluster can show
+# make test-cluster a Ray cluster of five nodes on this machine, nodes that are lost, and the slow faults: under 30 minutes
 # make check        the fast part, for every commit
 #
 # A laptop without a GPU: `make quickstart TORCH_INDEX=https://download.pytorch.org/whl/cpu` takes torch's small CPU build.
@@ -10,7 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install quickstart test check lint format clean
+.PHONY: install quickstart test test-cluster check lint format clean
 
 install: $(STAMP)
 
@@ -29,6 +30,9 @@ check: lint
 
 test: install
 	$(BIN)/python -m pytest -q -m "not cluster"
+
+test-cluster: install
+	$(BIN)/python -m pytest -q -m cluster
 
 lint: install
 	$(BIN)/ruff check .

@@ -101,3 +101,15 @@ def write_pictures(writer: SummaryWriter, step: int, model: SceneModel, photos: 
     if mask is not None:
         writer.add_image("view/mask", mask, step, dataformats="HW")
     model.train()
+
+
+def write_evaluation(folder: Path, step: int, protocol: str, mean: dict[str, float], picture: np.ndarray) -> None:
+    """An evaluation's means, and one of its pictures, uint8 (h, w, 3), made small; at the checkpoint's own step.
+
+    Each evaluation has a file of its own in `folder`: they come from any process, in any order.
+    """
+    stride = max(1, round(max(picture.shape[:2]) / PICTURE_SIDE))
+    with SummaryWriter(str(folder)) as writer:
+        for metric, value in mean.items():
+            writer.add_scalar(f"eval/{protocol}/{metric}", value, step)
+        writer.add_image(f"eval/{protocol}/view", picture[::stride, ::stride], step, dataformats="HWC")

@@ -15,7 +15,9 @@ import io
 import json
 import logging
 import shutil
+from collections.abc import Collection
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, NamedTuple
 
 import torch
@@ -46,8 +48,16 @@ class Checkpoint(NamedTuple):
     meta: dict[str, Any]
 
     def optimiser(self) -> dict[str, Any]:
-        """The optimiser's state, read when it is needed: evaluation never does."""
-        return torch.load(self.folder / TRAINING, map_location="cpu", weights_only=True)
+        """The optimiser's state, read when it is needed: evaluation never does.
+
+        Raises:
+            CheckpointError: the file holds something else, which is not read.
+        """
+        path = self.folder / TRAINING
+        try:
+            return torch.load(path, map_location="cpu", weights_only=True)
+        except (UnpicklingError, RuntimeError, EOFError) as error:
+            raise CheckpointError(f"{path}: holds other things than numbers, which are never read: not ours") from error
 
 
 def save_checkpoint(
@@ -94,7 +104,7 @@ def read_checkpoint(target: Path) -> Checkpoint:
         return Checkpoint(target, int(meta["step"]), model, meta)
     except FileNotFoundError as error:
         raise CheckpointError(f"{error.filename}: missing, the checkpoint was not completed") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, SafetensorError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, SafetensorError) as error:
         raise CheckpointError(f"{target}: cannot be read ({type(error).__name__}: {error})") from error
 
 
@@ -128,12 +138,14 @@ def latest_checkpoint(folder: Path) -> Checkpoint | None:
     return None
 
 
-def prune(folder: Path, keep: int) -> None:
-    """Remove all but the newest `keep` committed checkpoints, and the remains of older uncommitted ones."""
+def prune(folder: Path, keep: int, named: Collection[int] = ()) -> None:
+    """Remove all but the newest `keep` committed checkpoints and those of the steps in `named`, and the remains of
+    older uncommitted ones."""
     whole = committed(folder)
     if not whole:
         return
     stale = [p for p in folder.glob("step-????????") if p not in whole and p < whole[-1]]
-    for target in whole[:-keep] + stale:
+    spared = {folder_name(step) for step in named}
+    for target in [p for p in whole[:-keep] if p.name not in spared] + stale:
         (target / META).unlink(missing_ok=True)  # first, so that a half-removed one never counts
         shutil.rmtree(target, ignore_errors=True)

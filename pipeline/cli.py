@@ -15,7 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipeline.errors import CrossrayError
-from pipeline.log import set_up_logging
+from pipeline.log import plain, set_up_logging
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -36,7 +36,7 @@ def main() -> None:
         sys.exit(130)
     except (CrossrayError, OSError) as error:
         Console(stderr=True).print(
-            f"[bold red]crossray:[/] {escape(str(error))}", highlight=False, soft_wrap=True, markup=True
+            f"[bold red]crossray:[/] {escape(plain(str(error)))}", highlight=False, soft_wrap=True, markup=True
         )
         sys.exit(2)
 
@@ -90,10 +90,11 @@ def landmark(
 def run(
     job: Annotated[Path, typer.Argument(help="A job file, for example jobs/train_scene.yaml.")],
     settings: Settings = [],  # noqa: B006 (typer reads it once)
-    launcher: Annotated[str | None, typer.Option(help="local or torchrun; over the job's own.")] = None,
+    launcher: Annotated[str | None, typer.Option(help="local, torchrun or ray; over the job's own.")] = None,
 ) -> None:
     """Run a job file: shards if they are absent, training, evaluation. Again: goes on from where it was."""
     from pipeline.config import load_job
+    from pipeline.launch.home import go_home
     from pipeline.launch.run import run_job
     from pipeline.study import read_kind
 
@@ -103,7 +104,11 @@ def run(
         run_study_file(job, settings)
         return
     extra = [f"launcher={launcher}"] if launcher else []
+    if read_kind(job) == "reeval":
+        run_reeval_file(job, [*settings, *extra])
+        return
     resolved = load_job(job, [*settings, *extra])
+    go_home({"runs": resolved.runs, "scene.path": resolved.scene.path})
     trained, evaluated = run_job(resolved)
     if os.environ.get("RANK", "0") != "0":
         return
@@ -114,12 +119,56 @@ def run(
     print_line(f"TensorBoard: tensorboard --logdir {resolved.runs}")
 
 
+@app.command()
+def submit(
+    job: Annotated[Path, typer.Argument(help="A job file, for example jobs/train_scene.yaml.")],
+    settings: Settings = [],  # noqa: B006
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="The cluster; by default RAY_API_SERVER_ADDRESS, else this machine's."),
+    ] = None,
+    home: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Folder on the cluster that relative paths are meant from; by default this one for a cluster on this "
+            "machine, and else what CROSSRAY_HOME is there.",
+        ),
+    ] = None,
+    no_wait: Annotated[bool, typer.Option("--no-wait", help="Do not follow the log.")] = False,
+) -> None:
+    """Run a job file on a Ray cluster and follow its log; Ctrl-C ends the following, not the job."""
+    from pipeline.launch.submit import follow, how_it_ended, submit_job
+
+    submitted = submit_job(job, settings, address, home)
+    print_line(f"{submitted.id}: submitted. `{submitted.command('stop')}` stops it")
+    if no_wait:
+        return
+
+    def write(text: str) -> None:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+    try:
+        details = follow(submitted, write)
+    except KeyboardInterrupt:
+        print_line(f"\n{submitted.id}: goes on. `{submitted.command('logs --follow')}` follows it again")
+        print_line(f"`{submitted.command('stop')}` stops it, with a checkpoint")
+        raise
+    print_line(f"{submitted.id}: {how_it_ended(details)}")
+    if details.status.value != "SUCCEEDED":
+        raise typer.Exit(1)
+
+
 def run_study_file(file: Path, settings: list[str]) -> None:
     """Run a study and print its tables; exit status 1 if some of its runs are not done."""
+    from pipeline.launch.home import go_home
     from pipeline.launch.study import run_study
-    from pipeline.study import as_rich, captions, load_study
+    from pipeline.study import as_rich, captions, expand, load_study
 
     study = load_study(file, settings)
+    scenes = {f"scenes.{run.scene}.scene.path": run.job.scene.path for run in expand(study)}
+    go_home({"runs": study.runs, **scenes})
     tables, failures = run_study(study)
     console = Console() if sys.stdout.isatty() else Console(width=1000)  # nothing is wrapped in a file
     for table in tables:
@@ -130,6 +179,26 @@ def run_study_file(file: Path, settings: list[str]) -> None:
     for name, reason in failures.items():
         print_line(f"not done: {name}: {reason}")
     if failures:
+        raise typer.Exit(1)
+
+
+def run_reeval_file(file: Path, settings: list[str]) -> None:
+    """Run a re-evaluation; exit status 1 if a single pass could not evaluate something."""
+    from pipeline.launch.home import go_home
+    from pipeline.launch.reeval import run_reeval
+    from pipeline.reeval import load_reeval
+
+    reeval = load_reeval(file, settings)
+    for pattern in reeval.runs:
+        go_home({"runs": Path(pattern)})
+    summary = run_reeval(reeval)
+    if summary is None:
+        return
+    for state, lines in (("skipped", summary.skipped), ("failed", summary.failed)):
+        for line in lines:
+            print_line(f"{state}: {line}")
+    print_line(str(summary))
+    if summary.failed:
         raise typer.Exit(1)
 
 
@@ -233,11 +302,37 @@ def evaluate(
     step: Annotated[int | None, typer.Option(help="Checkpoint to evaluate; the newest by default.")] = None,
 ) -> None:
     """Score a run on its test photos under a protocol; metrics.json and pictures go to RUN/eval."""
-    from pipeline.evaluate import Codes, evaluate_run
+    from pipeline.evaluate import evaluate_protocols
 
-    codes: Codes = {}
-    for name in protocol:
-        print_scores(evaluate_run(run, name, step, codes))
+    for result in evaluate_protocols(run, protocol, step):
+        print_scores(result)
+
+
+@app.command()
+def status(
+    runs: Annotated[list[Path], typer.Argument(help="Runs, or folders of runs.")] = [Path("runs")],  # noqa: B006
+) -> None:
+    """How runs are doing: stage, step, time left, last checkpoint and evaluation, ranks alive."""
+    from pipeline.status import as_table, find_runs, status_of
+
+    console = Console() if sys.stdout.isatty() else Console(width=1000)
+    console.print(as_table([status_of(run) for run in find_runs(runs)]))
+
+
+@app.command()
+def compare(
+    a: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    b: Annotated[Path, typer.Argument(help="Folder of another one.")],
+) -> None:
+    """Compare two runs to the bit: every step's losses, and checkpoints. Exit status 1 if anything differs."""
+    from pipeline.compare import compare_runs
+
+    found = compare_runs(a, b)
+    for finding in found.findings:
+        print_line(f"{'same' if finding.same else 'DIFFERS':8}{finding.text}")
+    for key in found.differing_keys:
+        print_line(f"        job: {key}")
+    raise typer.Exit(0 if found.same else 1)
 
 
 @app.command("import-checkpoint")

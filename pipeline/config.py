@@ -22,6 +22,7 @@ from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.patches import PatchPlan
 
+MOST_VALUES = 10_000  # of a job file
 UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 # Keys of `train` that decide what is kept and shown, not what is learned: they may change between two starts of a run.
@@ -224,7 +225,7 @@ def load_job(path: Path, settings: Sequence[str] = ()) -> Job:
         JobError: the file, a key or a value is wrong; the message names it.
     """
     try:
-        raw = yaml.safe_load(path.read_text())
+        raw = parse_yaml(path.read_text())
     except OSError as error:
         raise JobError(f"{path}: cannot be read ({error.strerror})") from error
     except (yaml.YAMLError, ValueError) as error:
@@ -232,6 +233,25 @@ def load_job(path: Path, settings: Sequence[str] = ()) -> Job:
     if not isinstance(raw, dict):
         raise JobError(f"{path}: a job file is a mapping of keys to values, not {type(raw).__name__}")
     return make_job(raw, settings, source=str(path))
+
+
+def parse_yaml(text: str) -> Any:
+    """A YAML text as plain values.
+
+    Raises:
+        yaml.YAMLError: it is none.
+        ValueError: it stands for more values than a job has; a few lines of aliases can stand for billions.
+    """
+    value = yaml.safe_load(text)
+    left, todo = MOST_VALUES, [value]
+    while todo:
+        node = todo.pop()
+        inside = list(node.values()) if isinstance(node, dict) else node if isinstance(node, list) else []
+        todo += inside
+        left -= len(inside)
+        if left < 0:
+            raise ValueError(f"it stands for more than {MOST_VALUES} values")
+    return value
 
 
 def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "job") -> Job:
@@ -329,7 +349,7 @@ def parse_setting(setting: str) -> dict[str, Any]:
     if not equals or not key:
         raise JobError(f"--set {setting}: write key=value, for example --set train.epochs=5")
     try:
-        nested = yaml.safe_load(value)
+        nested = parse_yaml(value)
     except (yaml.YAMLError, ValueError) as error:
         raise JobError(f"--set {setting}: {value!r} is not YAML: {error}") from error
     for part in reversed(key.strip().split(".")):
@@ -344,6 +364,14 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
         merged[key] = merge(merged[key], value) if both else value
     return merged
+
+
+def flatten(mapping: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """{a: {b: c}} -> {"a.b": c}."""
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
 
 
 def as_dict(value: Any) -> dict[str, Any]:
@@ -364,7 +392,7 @@ def explain(error: Any) -> str:
     if error["type"] == "missing":
         return f"{key}: is missing"
     if key == "kind":
-        return f"kind: {error['input']!r} is not known (valid: train, study)"
+        return f"kind: {error['input']!r} is not known (valid: train, study, reeval)"
     return f"{key}: {error['msg'][:1].lower()}{error['msg'][1:]} (got {error['input']!r})"
 
 

@@ -2,6 +2,10 @@
 
 A protocol fixes everything that moves a number, and is always named with its downscale: `crnerf-full@R4`. Pictures and
 `metrics.json` go to `<run>/eval/<protocol>/step-<step>/`; metrics.json is written last.
+
+The views of a checkpoint are tasks: `score_views` is a pure function of a `Views`, and a mapper
+(pipeline/launch/tasks.py) runs them in this process or on a cluster. However they are split, the numbers are the same.
+A lock a checkpoint keeps two processes from evaluating the same one.
 """
 
 from __future__ import annotations
@@ -9,27 +13,36 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import logging
+import os
 import platform
 import re
 import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 import yaml
+from filelock import FileLock, Timeout
 from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
-from model.methods import smallest_side
+from model.methods import ModelSpec, smallest_side
 from model.scene_model import SceneModel
+from pipeline.best import write_best
+from pipeline.board import write_evaluation
 from pipeline.checkpoint import (
+    META,
     MODEL,
     Checkpoint,
     CheckpointError,
     committed,
+    digest,
     folder_name,
     latest_checkpoint,
     read_checkpoint,
@@ -39,22 +52,26 @@ from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write
 from pipeline.fit import FitRecipe, fit_code
 from pipeline.landmark import Landmark
-from pipeline.lpips import LPIPS, find_lpips
+from pipeline.lpips import LPIPS, VARIABLE, find_lpips, read_lpips
 from pipeline.metrics import psnr, ssim_11, ssim_window3, to_8bit
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
-from pipeline.render import View, read_appearance, render_picture
+from pipeline.render import View, colour_view, read_appearance, render_picture, render_view
 from pipeline.train import device_name
 from pipeline.truth import check_truth, elsewhere, mask_iou, reduced, truth_of
 
 log = logging.getLogger("crossray")
 
+METRICS = "metrics.json"
 LPIPS_SIDE = 31  # pixels; AlexNet has nothing left of a smaller picture
 AFFINE = "+affine"  # suffix of the control: colours fitted to the photo's left half by one affine map
 MASK_PHOTOS = 32  # training photos over which masks are compared with the truth, at most
 
-# Appearance codes that were fitted: of a checkpoint and a recipe, (photo, what it was read from) -> code.
-Codes = dict[tuple[str, FitRecipe], dict[tuple[int, str], torch.Tensor]]
+Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
+
+class CheckpointGone(CheckpointError):
+    """The checkpoint was removed, or written anew, while it was being evaluated: nothing is wrong with the run."""
 
 
 class Protocol(BaseModel):
@@ -95,6 +112,46 @@ def parse_protocol(name: str) -> tuple[Protocol, int, bool]:
     return protocol, int(match[2]), affine
 
 
+def job_of(run: Path) -> Job:
+    """The job of a run's folder. A run that was moved is where it is now; its shards stay where they were.
+
+    Raises:
+        CrossrayError: no such run.
+    """
+    if not (run / "job.yaml").is_file():
+        raise CrossrayError(f"{run} is not a run: it has no job.yaml")
+    job, folder = load_job(run / "job.yaml"), run.resolve()
+    scene = job.scene.model_copy(update={"shards": job.shards})
+    return job.model_copy(update={"runs": folder.parent, "name": folder.name, "scene": scene})
+
+
+def checkpoint_of(run: Path, step: int | None = None) -> Checkpoint:
+    """A run's checkpoint of `step`, by default the newest whole one.
+
+    Raises:
+        CheckpointError: there is none, or it is damaged.
+    """
+    if step is None:
+        checkpoint = latest_checkpoint(run / "checkpoints")
+        if checkpoint is None:
+            raise CheckpointError(f"{run / 'checkpoints'}: no committed checkpoint; has the run been trained?")
+        return checkpoint
+    steps = [int(p.name.removeprefix("step-")) for p in committed(run / "checkpoints")]
+    if step not in steps:
+        raise CheckpointError(f"{run}: no checkpoint of step {step}; there are {', '.join(map(str, steps)) or 'none'}")
+    return read_checkpoint(run / "checkpoints" / folder_name(step))
+
+
+def model_of(job: Job, checkpoint: Checkpoint, device: torch.device | None = None) -> SceneModel:
+    """A checkpoint's model in evaluation mode; by default on the GPU that this process has, if the job wants one."""
+    torch.backends.cudnn.allow_tf32 = False  # as in training
+    device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
+    box = torch.zeros(2, 3)  # the scene's box is one of its buffers
+    model = SceneModel(job.model, box, checkpoint.meta["photos"]).to(device).requires_grad_(False)
+    model.load_state_dict(checkpoint.model)
+    return model.eval()
+
+
 def load_run(
     run: Path, step: int | None = None, device: torch.device | None = None
 ) -> tuple[Job, SceneModel, Checkpoint]:
@@ -103,91 +160,350 @@ def load_run(
     Raises:
         CrossrayError: no such run, or no usable checkpoint in it.
     """
-    if not (run / "job.yaml").is_file():
-        raise CrossrayError(f"{run} is not a run: it has no job.yaml")
-    job = load_job(run / "job.yaml")
-    folder = run.resolve()
-    scene = job.scene.model_copy(update={"shards": job.shards})  # which stay where they were if the run is moved
-    job = job.model_copy(update={"runs": folder.parent, "name": folder.name, "scene": scene})
-    if step is None:
-        checkpoint = latest_checkpoint(run / "checkpoints")
-        if checkpoint is None:
-            raise CheckpointError(f"{run / 'checkpoints'}: no committed checkpoint; has the run been trained?")
-    else:
-        steps = [int(p.name.removeprefix("step-")) for p in committed(run / "checkpoints")]
-        if step not in steps:
-            raise CheckpointError(
-                f"{run}: no checkpoint of step {step}; there are {', '.join(map(str, steps)) or 'none'}"
-            )
-        checkpoint = read_checkpoint(run / "checkpoints" / folder_name(step))
-    torch.backends.cudnn.allow_tf32 = False  # as in training
-    device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
-    box = torch.zeros(2, 3)  # the scene's box is one of its buffers
-    if "photos" not in checkpoint.meta:
-        raise CheckpointError(f"{checkpoint.folder}: written by an older version of crossray; train the run again")
-    model = SceneModel(job.model, box, checkpoint.meta["photos"]).to(device).requires_grad_(False)
-    model.load_state_dict(checkpoint.model)
-    return job, model.eval(), checkpoint
+    job, checkpoint = job_of(run), checkpoint_of(run, step)
+    return job, model_of(job, checkpoint, device), checkpoint
 
 
-def evaluate_run(run: Path, protocol_name: str, step: int | None = None, codes: Codes | None = None) -> dict[str, Any]:
-    """Evaluate a run's checkpoint on its test photos; returns what metrics.json holds.
-
-    Args:
-        codes: appearance codes fitted before, for other protocols; new ones are added.
+def photos_of(job: Job, checkpoint: Checkpoint) -> Photos:
+    """The photos that a checkpoint was trained on.
 
     Raises:
-        CrossrayError: the run, the protocol or the shards cannot be used.
+        CrossrayError: the job's shards hold other ones, or cannot be read.
     """
-    protocol, downscale, affine = parse_protocol(protocol_name)
-    job, model, checkpoint = load_run(run, step)
-    check_downscale(job, protocol_name, downscale)
-    torch.set_num_threads(max(job.threads, torch.get_num_threads()))
     photos = open_photos(job.shards)
     if photos.manifest.content_hash != checkpoint.meta["shards"]:
         raise CrossrayError(
-            f"{job.shards}: other photos or masks than {run} was trained on; --set scene.shards=... in a new run, or "
-            "cut the shards again as they were"
+            f"{job.shards}: other photos or masks than {job.run} was trained on; --set scene.shards=... in a new run, "
+            "or cut the shards again as they were"
         )
-    indices = photos.indices("test")
-    if not indices:
-        raise CrossrayError(f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table")
-    out = run / "eval" / protocol_name / checkpoint.folder.name
-    lpips = usable_lpips(photos, indices, protocol)
-    judge = Judge(model, photos, protocol, truth_of(job, photos) if protocol.truth == "clean" else None)
-    if codes is not None:
-        judge.codes = codes.setdefault((checkpoint.meta["sha256"][MODEL], judge.recipe), judge.codes)
+    return photos
 
-    began = time.perf_counter()
-    progress = Progress(f"evaluating {run.name} under {protocol_name}")
-    rows = []
-    for done, index in enumerate(indices):
-        view, picture = judge.render(index)
-        if affine:
-            picture = fit_colours(picture, photos.image(index))
-        prediction = to_8bit(picture, protocol.rounding)
-        rows.append(judge.score(prediction, index, lpips))
-        save_png(out / f"{photos.records[index].key}.png", prediction)
-        save_png(out / f"{photos.records[index].key}.depth.png", depth_picture(view))
-        progress.update((done + 1) / len(indices), f"PSNR {np.mean([r['psnr'] for r in rows]):.2f}")
-    progress.close()
-    result = {
-        "protocol": protocol_name,
-        "definition": protocol.model_dump(mode="json"),
-        "step": checkpoint.step,
-        "checkpoint_sha256": checkpoint.meta["sha256"][MODEL],
-        "method": job.method,
-        "samples": list(samples_of(model, protocol) or ()) or "as in training",
-        "appearance_from": judge.appearance_from,
-        "mean": {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k not in ("name", "key")} | judge.masks(),
-        "images": rows,
-        "seconds": time.perf_counter() - began,
-        "device": device_name(next(model.parameters()).device),
-        "versions": {p: importlib.metadata.version(p) for p in ("torch", "numpy", "pillow", "scikit-image")},
-        "python": platform.python_version(),
-    }
-    atomic_write(out / "metrics.json", json.dumps(result, indent=2))
-    return result
+
+# --------------------------------------------------------------------------------------------------------- tasks
+
+
+class Views(NamedTuple):
+    """A task: some test views of one checkpoint, under protocols that share what is rendered and fitted."""
+
+    job: Job
+    step: int
+    checkpoint: str  # SHA-256 of its weights
+    protocols: tuple[str, ...]
+    photos: tuple[int, ...]  # which test photos
+    masks: bool  # whether masks are compared with the truth, where it is known
+    lpips: tuple[str, ...]  # of the protocols, those under which LPIPS is scored
+    weights: Path | None  # of LPIPS, where the environment of whoever asks for the evaluation names them
+
+
+class Scores(NamedTuple):
+    """What became of a task; by protocol."""
+
+    run: Path
+    step: int
+    rows: dict[str, dict[int, dict[str, Any]]]  # photo -> metrics
+    masks: dict[str, dict[str, float]]
+    seconds: dict[str, float]
+    device: str
+
+
+def score_views(task: Views) -> Scores:
+    """Render a task's views and score them; their pictures are written, `metrics.json` is left to the caller.
+
+    Raises:
+        CheckpointGone: the checkpoint is not there any more.
+        CrossrayError: the checkpoint, the photos or the weights of LPIPS cannot be used on this machine.
+    """
+    with threads_of(task.job):
+        model, photos = loaded(task)
+        lpips = None
+        if task.lpips:
+            lpips = read_lpips(task.weights) if task.weights else find_lpips()
+            if lpips is None:
+                raise CrossrayError("LPIPS: the weights that were found before are not on this machine")
+        judges, shared = {}, Shared()
+        for name in task.protocols:
+            protocol = parse_protocol(name)[0]
+            landmark = truth_of(task.job, photos) if protocol.truth == "clean" else None
+            judges[name] = Judge(model, photos, protocol, landmark, shared)
+        rows: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in judges}
+        seconds = dict.fromkeys(judges, 0.0)
+        for index in task.photos:
+            for name, judge in judges.items():
+                began = time.perf_counter()
+                folder = results_folder(task.job.run, name, task.step)
+                rows[name][index] = score_view(judge, index, folder, name, lpips if name in task.lpips else None)
+                seconds[name] += time.perf_counter() - began
+        masks = {name: judge.masks() for name, judge in judges.items()} if task.masks else {}
+        return Scores(task.job.run, task.step, rows, masks, seconds, device_name(next(model.parameters()).device))
+
+
+def score_view(judge: Judge, index: int, folder: Path, name: str, lpips: LPIPS | None) -> dict[str, Any]:
+    """One view under one protocol: its pictures in `folder`, its metrics."""
+    view, picture = judge.render(index)
+    if parse_protocol(name)[2]:
+        picture = fit_colours(picture, judge.photos.image(index))
+    prediction, key = to_8bit(picture, judge.protocol.rounding), judge.photos.records[index].key
+    row = judge.score(prediction, index, lpips)
+    save_png(folder / f"{key}.png", prediction)
+    save_png(folder / f"{key}.depth.png", depth_picture(view))
+    return row
+
+
+@contextmanager
+def threads_of(job: Job) -> Iterator[None]:
+    """The job's torch threads, or those that the process has if they are more."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(job.threads, before))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+_latest: dict[tuple[Path, str], tuple[SceneModel, Photos]] = {}  # of the task before: the next one is mostly alike
+
+
+def loaded(task: Views) -> tuple[SceneModel, Photos]:
+    """A task's model and photos, read once a process as long as its tasks are of one checkpoint."""
+    key = (task.job.run, task.checkpoint)
+    if key not in _latest:
+        _latest.clear()
+        folder = task.job.run / "checkpoints" / folder_name(task.step)
+        try:
+            checkpoint = read_checkpoint(folder)
+        except CheckpointError as error:
+            if (folder / META).exists():
+                raise
+            raise CheckpointGone(f"{folder}: it was removed before it was evaluated") from error
+        if checkpoint.meta["sha256"][MODEL] != task.checkpoint:
+            raise CheckpointGone(f"{folder}: it was written anew while it was being evaluated")
+        _latest[key] = model_of(task.job, checkpoint), photos_of(task.job, checkpoint)
+    return _latest[key]
+
+
+# ---------------------------------------------------------------------------------------------------- evaluations
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One checkpoint under some protocols: its tasks, and what their scores add up to.
+
+    Whoever runs the tasks holds the checkpoint (`lock_of`) from before `begin` until after `commit`.
+    """
+
+    job: Job
+    checkpoint: Checkpoint
+    protocols: tuple[str, ...]
+    photos: Photos
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Which photos are scored."""
+        return self.photos.indices("test")
+
+    def folder(self, name: str) -> Path:
+        """Where the results under a protocol go."""
+        return results_folder(self.job.run, name, self.checkpoint.step)
+
+    def begin(self) -> list[Views]:
+        """The tasks. Results of another checkpoint of this step must not vouch for new pictures: they go."""
+        definitions = {name: parse_protocol(name)[0] for name in self.protocols}
+        for name in self.protocols:
+            if recorded(self.job.run, name, self.checkpoint) is None:
+                (self.folder(name) / METRICS).unlink(missing_ok=True)
+        named = os.environ.get(VARIABLE)
+        task = Views(
+            job=self.job,
+            step=self.checkpoint.step,
+            checkpoint=self.checkpoint.meta["sha256"][MODEL],
+            protocols=self.protocols,
+            photos=(),
+            masks=False,
+            lpips=tuple(n for n, p in definitions.items() if lpips_usable(self.photos, self.indices, p)),
+            weights=Path(named).absolute() if named else None,
+        )
+        tasks = [task._replace(photos=(index,)) for index in self.indices]
+        clean = tuple(name for name, protocol in definitions.items() if protocol.truth == "clean")
+        return tasks + ([task._replace(protocols=clean, lpips=(), masks=True)] if clean else [])
+
+    def commit(self, parts: Sequence[Scores]) -> list[dict[str, Any]]:
+        """Record the scores of all tasks: curves, then metrics.json, then the pointer to the best checkpoint; returns
+        what each protocol's metrics.json holds."""
+        results = []
+        for name in self.protocols:
+            folder, result = self.folder(name), self.result(name, parts)
+            for stray in folder.glob(".*.tmp"):  # of tasks that were killed
+                stray.unlink(missing_ok=True)
+            with Image.open(folder / f"{result['images'][0]['key']}.png") as picture:
+                board = self.job.run / "tensorboard" / "eval"
+                write_evaluation(board, self.checkpoint.step, name, result["mean"], np.asarray(picture))
+            atomic_write(folder / METRICS, json.dumps(result, indent=2))
+            update_best(self.job.run, name)
+            results.append(result)
+        return results
+
+    def result(self, name: str, parts: Sequence[Scores]) -> dict[str, Any]:
+        """What metrics.json holds of one protocol."""
+        protocol, spec = parse_protocol(name)[0], self.job.model
+        found = {index: row for part in parts for index, row in part.rows.get(name, {}).items()}
+        rows = [found[index] for index in self.indices]
+        mean = {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k not in ("name", "key")}
+        for part in parts:
+            mean |= part.masks.get(name, {})
+        return {
+            "protocol": name,
+            "definition": protocol.model_dump(mode="json"),
+            "step": self.checkpoint.step,
+            "checkpoint_sha256": self.checkpoint.meta["sha256"][MODEL],
+            "method": self.job.method,
+            "samples": list(samples_of(spec, protocol) or ()) or "as in training",
+            "appearance_from": appearance_from(spec, protocol),
+            "mean": mean,
+            "images": rows,
+            "seconds": sum(part.seconds.get(name, 0.0) for part in parts),
+            "device": ", ".join(sorted({part.device for part in parts})),
+            "versions": {p: importlib.metadata.version(p) for p in ("torch", "numpy", "pillow", "scikit-image")},
+            "python": platform.python_version(),
+        }
+
+
+def prepare(job: Job, checkpoint: Checkpoint, protocols: Sequence[str]) -> Evaluation:
+    """An evaluation that is not begun.
+
+    Raises:
+        CrossrayError: a protocol, or the shards, cannot be used.
+    """
+    for name in protocols:
+        check_protocol(job, name)
+    photos = photos_of(job, checkpoint)
+    if not photos.indices("test"):
+        raise CrossrayError(f"{job.shards}: no test photos, so there is nothing to evaluate; see the split table")
+    for name in protocols:
+        if parse_protocol(name)[0].truth == "clean":
+            truth_of(job, photos)
+    return Evaluation(job, checkpoint._replace(model={}), tuple(dict.fromkeys(protocols)), photos)
+
+
+def evaluate_run(run: Path, protocol: str, step: int | None = None) -> dict[str, Any]:
+    """Like evaluate_protocols, for one."""
+    return evaluate_protocols(run, [protocol], step)[0]
+
+
+def evaluate_protocols(
+    run: Path, protocols: Sequence[str], step: int | None = None, mapper: Mapper = map
+) -> list[dict[str, Any]]:
+    """Evaluate a run's checkpoint (the newest, or `step`) on its test photos, also if that was done before; returns
+    what each protocol's metrics.json holds.
+
+    Raises:
+        CrossrayError: the run, a protocol or the shards cannot be used.
+    """
+    for name in protocols:
+        parse_protocol(name)
+    evaluation = prepare(job_of(run), checkpoint_of(run, step), protocols)
+    with alone(evaluation.checkpoint):
+        return carry_out(evaluation, mapper)
+
+
+def run_protocols(job: Job, mapper: Mapper = map) -> list[dict[str, Any]]:
+    """Every protocol that the job asks for, for its newest checkpoint; what that was scored under before is read, not
+    done again."""
+    if not job.evaluate.protocols:
+        return []
+    newest = checkpoint_of(job.run)
+    with alone(newest):
+        done = {name: recorded(job.run, name, newest) for name in job.evaluate.protocols}
+        lacking = [name for name, result in done.items() if result is None]
+        if lacking:
+            fresh = carry_out(prepare(job_of(job.run), newest, lacking), mapper)
+            done |= {result["protocol"]: result for result in fresh}
+    return [result for result in done.values() if result is not None]
+
+
+def carry_out(evaluation: Evaluation, mapper: Mapper) -> list[dict[str, Any]]:
+    """Run an evaluation's tasks, with a progress line, and commit it."""
+    first, *others = evaluation.protocols
+    more = f" and {len(others)} more" if others else ""
+    progress = Progress(f"evaluating {evaluation.job.name} under {first}{more}")
+    parts: list[Scores] = []
+    try:
+        for part in mapper(score_views, evaluation.begin()):
+            parts.append(part)
+            psnrs = [row["psnr"] for p in parts for row in p.rows.get(first, {}).values()]
+            progress.update(len(psnrs) / len(evaluation.indices), f"PSNR {np.mean(psnrs):.2f}" if psnrs else "")
+    finally:
+        progress.close()
+    return evaluation.commit(parts)
+
+
+def results_folder(run: Path, protocol_name: str, step: int) -> Path:
+    """Where pictures and metrics.json of a checkpoint under a protocol are."""
+    return run / "eval" / protocol_name / folder_name(step)
+
+
+def lock_of(run: Path, name: str) -> FileLock:
+    """Held by whoever evaluates the checkpoint of this name; whoever dies lets go of it."""
+    folder = run / ".evaluating"
+    folder.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder / f"{name}.lock")
+
+
+@contextmanager
+def alone(checkpoint: Checkpoint) -> Iterator[None]:
+    """Wait until nobody else evaluates this checkpoint, and hold it."""
+    run, name = checkpoint.folder.parents[1], checkpoint.folder.name
+    lock = lock_of(run, name)
+    try:
+        lock.acquire(timeout=1)
+    except Timeout:
+        log.info("%s, %s: another process is evaluating it; waiting for that", run, name)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def update_best(run: Path, protocol_name: str) -> None:
+    """Point `best.json` of a protocol to the best checkpoint that is there."""
+    with lock_of(run, "best"):
+        results = []
+        for target in committed(run / "checkpoints"):
+            try:
+                results.append(recorded(run, protocol_name, described(target)))
+            except CheckpointError:
+                continue
+        write_best(run / "eval" / protocol_name, [result for result in results if result is not None])
+
+
+def described(target: Path) -> Checkpoint:
+    """What a checkpoint says of itself: its tensors are neither read nor verified.
+
+    Raises:
+        CheckpointError: it is not there, or its description is damaged.
+    """
+    try:
+        meta = json.loads((target / META).read_text())
+        if meta["digest"] != digest(meta) or target.name != folder_name(meta["step"]):
+            raise CheckpointError(f"{target / META}: its content is not what was written: damaged")
+        return Checkpoint(target, int(meta["step"]), {}, meta)
+    except FileNotFoundError as error:
+        raise CheckpointGone(f"{target}: it was removed before it was evaluated") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{target}: cannot be read ({type(error).__name__}: {error})") from error
+
+
+# --------------------------------------------------------------------------------------------------------- judging
+
+
+@dataclass
+class Shared:
+    """What the protocols of one checkpoint need not do twice."""
+
+    codes: dict[tuple[FitRecipe, int, str], torch.Tensor] = field(default_factory=dict)
+    """(recipe, photo, what it was read from) -> fitted code."""
+    views: dict[tuple[int, tuple[int, int] | None], View] = field(default_factory=dict)
+    """(photo, samples) -> view, of the latest photo alone: it takes as much memory as all else."""
 
 
 class Judge:
@@ -195,25 +511,33 @@ class Judge:
 
     Args:
         landmark: the truth behind the photos, for a protocol that scores against it.
+        shared: with the judges of the same model under other protocols.
     """
 
-    def __init__(self, model: SceneModel, photos: Photos, protocol: Protocol, landmark: Landmark | None) -> None:
+    def __init__(
+        self,
+        model: SceneModel,
+        photos: Photos,
+        protocol: Protocol,
+        landmark: Landmark | None,
+        shared: Shared | None = None,
+    ) -> None:
         self.model, self.photos, self.protocol, self.landmark = model, photos, protocol, landmark
-        self.codes: dict[tuple[int, str], torch.Tensor] = {}  # (photo, what it was read from) -> fitted code
-
-    @property
-    def appearance_from(self) -> str:
-        """What appearances are read from. A learned code is fitted, which on scored pixels would be training on them:
-        so it sees the left half where others see the whole photo."""
-        if self.model.spec.appearance == "none":
-            return "nothing"
-        fitted = self.model.embedding is not None and self.protocol.appearance == "whole"
-        return "left" if fitted else self.protocol.appearance
+        self.shared = shared or Shared()
+        self.appearance_from = appearance_from(model.spec, protocol)
 
     def render(self, index: int) -> tuple[View, np.ndarray]:
         """A test photo's view in the appearance that the protocol lets the model see."""
-        samples = samples_of(self.model, self.protocol)
-        return render_picture(self.model, self.photos.records[index], self.appearance(index), samples)
+        camera, appearance = self.photos.records[index], self.appearance(index)
+        samples = samples_of(self.model.spec, self.protocol)
+        if self.model.coded:  # the field itself reads the appearance: another view for each
+            return render_picture(self.model, camera, appearance, samples)
+        key = (index, samples)
+        if key not in self.shared.views:
+            self.shared.views.clear()
+            self.shared.views[key] = render_view(self.model, camera, samples=samples)
+        view = self.shared.views[key]
+        return view, colour_view(self.model, view, appearance)
 
     def appearance(self, index: int) -> torch.Tensor | None:
         """F^a of a test photo."""
@@ -229,12 +553,12 @@ class Judge:
         if self.model.embedding is None:
             self.check_reference(reference, index)
             return read_appearance(self.model, reference)
-        key = (index, self.appearance_from)
-        if key not in self.codes:
+        codes, key = self.shared.codes, (self.recipe, index, self.appearance_from)
+        if key not in codes:
             columns = left_half(image).shape[1] if self.appearance_from == "left" else image.shape[1]
             camera = self.photos.records[source]
-            self.codes[key] = fit_code(self.model, image, camera, columns, self.recipe, seed=index)
-        return self.codes[key]
+            codes[key] = fit_code(self.model, image, camera, columns, self.recipe, seed=index)
+        return codes[key]
 
     def check_reference(self, reference: np.ndarray, index: int) -> None:
         """CrossrayError where what may be seen of a photo is too small for the appearance network."""
@@ -272,23 +596,31 @@ class Judge:
         return {} if iou is None else {"mask_iou": iou}
 
 
+def appearance_from(spec: ModelSpec, protocol: Protocol) -> str:
+    """What appearances are read from. A learned code is fitted, which on scored pixels would be training on them: so it
+    sees the left half where others see the whole photo."""
+    if spec.appearance == "none":
+        return "nothing"
+    fitted = spec.appearance == "embedding" and protocol.appearance == "whole"
+    return "left" if fitted else protocol.appearance
+
+
 def left_half(picture: np.ndarray) -> np.ndarray:
     """The left half of (h, w, ...), with the middle column where the width is odd."""
     return picture[:, : picture.shape[1] - picture.shape[1] // 2]
 
 
-def usable_lpips(photos: Photos, indices: tuple[int, ...], protocol: Protocol) -> LPIPS | None:
-    """LPIPS where its weights are found and all pictures are large enough; else None, and the log says why."""
-    lpips = find_lpips()
-    if lpips is None:
-        warn_once("LPIPS is left out: no weights found; CROSSRAY_LPIPS=/path/to/lpips_alex.npz names them")
-        return None
+def lpips_usable(photos: Photos, indices: tuple[int, ...], protocol: Protocol) -> bool:
+    """Whether the weights of LPIPS are found and all pictures are large enough; if not, the log says why."""
+    if find_lpips() is None:
+        warn_once(f"LPIPS is left out: no weights found; {VARIABLE}=/path/to/lpips_alex.npz names them")
+        return False
     for record in (photos.records[i] for i in indices):
         width = record.width // 2 if protocol.scored == "right" else record.width
         if min(record.height, width) < LPIPS_SIDE:
             warn_once(f"LPIPS is left out: what is scored of {record.name} has a side under {LPIPS_SIDE} pixels")
-            return None
-    return lpips
+            return False
+    return True
 
 
 @cache
@@ -297,9 +629,9 @@ def warn_once(text: str) -> None:
     log.warning(text)
 
 
-def samples_of(model: SceneModel, protocol: Protocol) -> tuple[int, int] | None:
+def samples_of(spec: ModelSpec, protocol: Protocol) -> tuple[int, int] | None:
     """Sample counts of the rendering; None keeps those of training (the protocols only speak of the MLP field)."""
-    return protocol.mlp_samples if model.spec.field == "mlp" else None
+    return protocol.mlp_samples if spec.field == "mlp" else None
 
 
 def score(
@@ -354,30 +686,27 @@ def check_downscale(job: Job, protocol_name: str, downscale: int) -> None:
         )
 
 
+def check_protocol(job: Job, name: str) -> None:
+    """CrossrayError where a job's runs cannot be evaluated under a protocol."""
+    protocol, downscale, _ = parse_protocol(name)
+    check_downscale(job, name, downscale)
+    if protocol.truth == "clean":
+        check_truth(job)
+
+
 def check_protocols(job: Job) -> None:
     """CrossrayError for a protocol that could only be refused after the training."""
     for name in job.evaluate.protocols:
-        protocol, downscale, _ = parse_protocol(name)
-        check_downscale(job, name, downscale)
-        if protocol.truth == "clean":
-            check_truth(job)
-
-
-def run_protocols(job: Job) -> list[dict[str, Any]]:
-    """Every protocol that the job asks for; what this checkpoint was scored under before is read, not done again."""
-    newest = load_run(job.run)[2]
-    codes: Codes = {}
-    return [
-        recorded(job.run, name, newest) or evaluate_run(job.run, name, codes=codes) for name in job.evaluate.protocols
-    ]
+        check_protocol(job, name)
 
 
 def recorded(run: Path, protocol_name: str, checkpoint: Checkpoint) -> dict[str, Any] | None:
-    """An evaluation of just this checkpoint under just this definition of the protocol, if it was made before."""
-    path = run / "eval" / protocol_name / checkpoint.folder.name / "metrics.json"
-    if not path.is_file():
+    """An evaluation of just this checkpoint under just this definition of the protocol, if it was made before. One that
+    cannot be read was not."""
+    try:
+        result = json.loads((results_folder(run, protocol_name, checkpoint.step) / METRICS).read_text())
+        of, defined, _ = result["checkpoint_sha256"], result["definition"], float(result["mean"]["psnr"])
+    except (OSError, ValueError, KeyError, TypeError):
         return None
-    result = json.loads(path.read_text())
     definition = parse_protocol(protocol_name)[0].model_dump(mode="json")
-    same = result["checkpoint_sha256"] == checkpoint.meta["sha256"][MODEL] and result["definition"] == definition
-    return result if same else None
+    return result if (of, defined) == (checkpoint.meta["sha256"][MODEL], definition) else None

@@ -2,6 +2,7 @@
 run that goes on from one that has died.
 
     <run>/ranks/rank-<r>.json    host, process, time, stage, step, how far, how long still
+    <run>/ranks/driver.json      host, process, and the stage around the training; once a stage
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ log = logging.getLogger("crossray")
 
 INTERVAL = 2.0  # seconds between two beats
 SILENCE = 30.0  # seconds without a beat after which a rank on another machine counts as lost
-FOLDER = "ranks"
+STAGES = ("making shards", "starting ranks", "evaluating")  # of a driver, while there are no ranks or none any more
 
 
 class Heartbeat:
@@ -57,7 +58,12 @@ class Heartbeat:
 
 def rank_path(run: Path, rank: int) -> Path:
     """Where a rank writes."""
-    return run / FOLDER / f"rank-{rank}.json"
+    return run / "ranks" / f"rank-{rank}.json"
+
+
+def driver_path(run: Path) -> Path:
+    """Where the process writes that takes a run through its stages."""
+    return run / "ranks" / "driver.json"
 
 
 def read_beat(path: Path) -> dict[str, Any] | None:

@@ -284,7 +284,9 @@ def find_photo_folder(root: Path, model_folder: Path) -> Path:
 
 
 def is_inside(folder: Path, name: str) -> bool:
-    return not Path(name).is_absolute() and (folder / name).resolve().is_relative_to(folder.resolve())
+    return (
+        "\0" not in name and not Path(name).is_absolute() and (folder / name).resolve().is_relative_to(folder.resolve())
+    )
 
 
 # Health

@@ -508,9 +508,15 @@ def decode_png(data: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
     Raises:
         ValueError: not a PNG, or not of `shape`.
     """
-    with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
+    try:
+        image = Image.open(io.BytesIO(data), formats=["PNG"])
+    except Image.DecompressionBombError as error:
+        raise ValueError(str(error)) from None
+    with image:
         if image.mode not in ("RGB", "L"):
             raise ValueError(f"a PNG of mode {image.mode}")
+        if shape is not None and image.size != shape[1::-1]:  # before it takes memory
+            raise ValueError(f"a picture of {image.width} x {image.height} pixels, not {shape[1]} x {shape[0]}")
         pixels = np.asarray(image)
     if shape is not None and pixels.shape != shape:
         raise ValueError(f"a picture of shape {pixels.shape}, not {shape}")
@@ -551,7 +557,7 @@ def read_manifest(folder: Path) -> Manifest:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise ShardError(f"{path} is damaged ({place}: {first['msg']}): remove it and cut the shards again") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ShardError(f"{path} is damaged ({error}): remove it and cut the shards again") from error
 
 

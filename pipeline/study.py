@@ -36,6 +36,7 @@ from pipeline.config import (
     merge,
     nearest,
     parse_setting,
+    parse_yaml,
 )
 from pipeline.evaluate import recorded
 from pipeline.files import atomic_write
@@ -139,7 +140,11 @@ def load_study(path: Path, settings: Sequence[str] = ()) -> StudyJob:
     Raises:
         JobError: a key or a value is wrong; the message names it, and where there is one the variant and the scene.
     """
-    return make_study(yaml.safe_load(path.read_text()), settings, source=str(path))
+    try:
+        raw = parse_yaml(path.read_text())
+    except (yaml.YAMLError, ValueError) as error:
+        raise JobError(f"{path}: not a YAML file: {error}") from error
+    return make_study(raw, settings, source=str(path))
 
 
 def make_study(raw: Keys, settings: Sequence[str] = (), source: str = "study") -> StudyJob:

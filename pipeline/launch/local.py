@@ -11,7 +11,8 @@ from typing import Any
 
 from pipeline.config import Job, save_job
 from pipeline.errors import CrossrayError
-from pipeline.launch.torchrun import StopFlag, pick_device, run_rank_of
+from pipeline.launch.stop import StopFlag
+from pipeline.launch.torchrun import pick_device, run_rank_of
 from pipeline.photos import open_photos
 from pipeline.train import Context, train
 

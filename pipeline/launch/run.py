@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import logging
 import os
+from contextlib import nullcontext
 from importlib.util import find_spec
 from typing import Any
 
 import yaml
 from filelock import FileLock
 
-from pipeline.config import BOOKKEEPING, Job, save_job
+from pipeline.config import BOOKKEEPING, Job, flatten, save_job
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import check_protocols, run_protocols
+from pipeline.heartbeat import Heartbeat, driver_path
 from pipeline.launch.local import run_local
-from pipeline.launch.tasks import ray_tasks
+from pipeline.launch.reeval import each_checkpoint, evaluation_tasks
+from pipeline.launch.tasks import ray_session, ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
 from pipeline.masks import read_record
 from pipeline.progress import shown
@@ -38,6 +41,9 @@ def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """
     check_protocols(job)
     launcher = launcher_of(job)
+    check_each_checkpoint(job, launcher)
+    if launcher == "ray":
+        return run_on_ray(job)
     if launcher == "local":
         pick_device(job, job.ranks - 1)  # a job that wants more than there is says so before anything is started
     ensure_shards(job)
@@ -47,8 +53,44 @@ def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         if int(os.environ["RANK"]) != 0:
             return trained, []
     else:
+        enter(job, "starting ranks")
         trained = run_local(job)
-    return trained, run_protocols(job) if trained["finished"] else []
+    if not trained["finished"]:
+        return trained, []
+    enter(job, "evaluating")
+    return trained, run_protocols(job)
+
+
+def run_on_ray(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Like run_job, with one Ray for all stages: shards and evaluation are its tasks."""
+    from pipeline.launch.ray_train import check_cluster, run_ray
+
+    with ray_session():
+        check_cluster(job)  # a job that wants more than there is says so before anything is started
+        ensure_shards(job)
+        claim_run(job)
+        enter(job, "starting ranks")
+        with each_checkpoint(job) if job.evaluate.each_checkpoint else nullcontext():
+            trained = run_ray(job)
+        if not trained["finished"]:
+            return trained, []
+        enter(job, "evaluating")
+        with evaluation_tasks() as mapper:
+            return trained, run_protocols(job, mapper)
+
+
+def enter(job: Job, stage: str) -> None:
+    """Tell those who watch what this process does now."""
+    Heartbeat(driver_path(job.run)).beat(stage)
+
+
+def check_each_checkpoint(job: Job, launcher: str) -> None:
+    """CrossrayError where a job wants evaluations beside its ranks, and nobody has a place for them."""
+    if job.evaluate.each_checkpoint and launcher != "ray":
+        raise CrossrayError(
+            f"evaluate.each_checkpoint: launcher {launcher} has no place for evaluations beside the ranks; --set "
+            "evaluate.each_checkpoint=false, and start jobs/reeval.yaml beside the training"
+        )
 
 
 def launcher_of(job: Job) -> str:
@@ -72,10 +114,11 @@ def claim_run(job: Job) -> None:
         if path.exists():
             before = flatten(yaml.safe_load(path.read_text()))
             now = flatten(job.model_dump(mode="json"))
+            free = (*FREE_KEYS, "ranks") if job.train.any_ranks else FREE_KEYS
             differs = [
                 f"  {key}: {before.get(key)!r} -> {now.get(key)!r}"
                 for key in sorted(before.keys() | now.keys())
-                if before.get(key) != now.get(key) and not key.startswith(FREE_KEYS)
+                if before.get(key) != now.get(key) and not key.startswith(free)
             ]
             if differs:
                 raise CrossrayError(
@@ -83,14 +126,6 @@ def claim_run(job: Job) -> None:
                     "Choose another name (--set name=...), or remove that folder"
                 )
         save_job(job, path)
-
-
-def flatten(mapping: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{a: {b: c}} -> {"a.b": c}."""
-    flat: dict[str, Any] = {}
-    for key, value in mapping.items():
-        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
 
 
 def scene_at_hand(job: Job) -> Scene | None:
@@ -128,8 +163,8 @@ def check_masks(job: Job, scene: Scene) -> None:
 
 
 def ensure_shards(job: Job) -> Manifest:
-    """The job's shards, cut by Ray tasks if they are not there, or if the masks that the job reads have changed; Ray is
-    gone when this returns.
+    """The job's shards, cut by Ray tasks if they are not there, or if the masks that the job reads have changed; a
+    Ray that was started for it is gone when this returns.
 
     Raises:
         CrossrayError: the scene or its masks are missing, or the shards that are there are of another size.
@@ -162,6 +197,7 @@ def ensure_shards(job: Job) -> Manifest:
 
 def cut(job: Job) -> Manifest:
     """Cut the job's shards as Ray tasks."""
+    enter(job, "making shards")
     scene = job.scene
     with ray_tasks() as mapper:
         return cut_shards(

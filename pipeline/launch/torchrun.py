@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +12,10 @@ import torch.distributed as dist
 
 from pipeline.config import Job, load_job
 from pipeline.errors import CrossrayError
+from pipeline.launch.stop import RankStop
+from pipeline.launch.stop import StopFlag as StopFlag  # local.py and study.py take it from here for now
 from pipeline.log import set_up_logging
 from pipeline.train import Context, train
-
-
-class StopFlag:
-    """Set by SIGTERM or Ctrl-C: the ranks agree on it, write a checkpoint and return. A later Ctrl-C ends at once."""
-
-    def __init__(self) -> None:
-        self.set = False
-        self.since = 0.0
-
-    def install(self) -> StopFlag:
-        """Listen from now on."""
-        signal.signal(signal.SIGTERM, self.stop)
-        signal.signal(signal.SIGINT, self.stop)
-        return self
-
-    def stop(self, number: int, frame: object) -> None:
-        """The handler. One Ctrl-C arrives twice where a launcher hands it to ranks that had it from the terminal."""
-        if self.set and number == signal.SIGINT and time.monotonic() - self.since > 2:
-            raise KeyboardInterrupt
-        if not self.set:
-            self.set, self.since = True, time.monotonic()
-
-    def __call__(self) -> bool:
-        return self.set
 
 
 def pick_device(job: Job, local_rank: int) -> torch.device:
@@ -68,7 +44,7 @@ def run_rank(job: Job) -> dict[str, Any]:
     """Train as the rank that RANK, WORLD_SIZE and LOCAL_RANK say.
 
     Raises:
-        CrossrayError: the variables are missing, or WORLD_SIZE is not the job's `ranks`.
+        CrossrayError: the variables are missing, WORLD_SIZE is not the job's `ranks`, or restarts would not work.
     """
     try:
         rank, world, local_rank = (int(os.environ[k]) for k in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
@@ -79,14 +55,26 @@ def run_rank(job: Job) -> dict[str, Any]:
         ) from None
     if world != job.ranks:
         raise CrossrayError(f"ranks: the job wants {job.ranks}, torchrun started {world}; --set ranks={world} fits")
+    check_restarts()
     device = pick_device(job, local_rank)
     if device.type == "cuda":
         torch.cuda.set_device(device)
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
     try:
-        return train(job, Context(rank, world, device, StopFlag().install()))
+        return train(job, Context(rank, world, device, RankStop().install()))
     finally:
         dist.destroy_process_group()
+
+
+def check_restarts() -> None:
+    """CrossrayError where torchrun would start ranks again with the addresses of dead ones: it keeps one store for all
+    tries unless it is told not to (pytorch issue 135712)."""
+    restarts = os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")
+    if restarts != "0" and os.environ.get("TORCH_DISABLE_SHARE_RDZV_TCP_STORE") != "1":
+        raise CrossrayError(
+            f"torchrun --max-restarts={restarts} lets new ranks read the addresses of dead ones, and the restart can "
+            "fail; start it with TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1 in the environment"
+        )
 
 
 def run_rank_of(job_file: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+import tiny_run
 import torch
 from PIL import Image
 from tiny_run import cut_tiny, tiny_job
@@ -14,7 +15,22 @@ from tiny_run import cut_tiny, tiny_job
 from pipeline import evaluate as module
 from pipeline.checkpoint import CheckpointError
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import Judge, evaluate_run, fit_colours, load_run, parse_protocol
+from pipeline.evaluate import (
+    CheckpointGone,
+    Judge,
+    checkpoint_of,
+    evaluate_protocols,
+    evaluate_run,
+    fit_colours,
+    job_of,
+    load_run,
+    lock_of,
+    parse_protocol,
+    prepare,
+    recorded,
+    run_protocols,
+    score_views,
+)
 from pipeline.fit import FitRecipe, fit_code
 from pipeline.launch.run import claim_run
 from pipeline.metrics import ssim_11, ssim_window3
@@ -45,6 +61,7 @@ def trained(tmp_path_factory):
 def _environment(trained, monkeypatch):
     monkeypatch.setenv("CROSSRAY_CACHE", str(trained / "cache"))
     monkeypatch.setattr(module, "find_lpips", lambda: None)
+    monkeypatch.delenv("CROSSRAY_LPIPS", raising=False)
 
 
 @pytest.fixture
@@ -172,10 +189,139 @@ def test_metrics_come_last(run, monkeypatch):
     assert not list(folder.rglob("metrics.json"))
 
 
+def test_results_of_another_checkpoint_go_before_its_pictures_do(run, monkeypatch):
+    folder = run()
+    evaluate_run(folder, "crnerf-full@R2")
+    path = folder / "eval" / "crnerf-full@R2" / STEP / "metrics.json"
+    whole = path.read_text()
+    monkeypatch.setattr(module, "score", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_run(folder, "crnerf-full@R2")
+    assert path.read_text() == whole  # of this very checkpoint: its pictures are the same
+    path.write_text(json.dumps(json.loads(whole) | {"checkpoint_sha256": "0" * 64}))
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_run(folder, "crnerf-full@R2")
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"definition": {}}', "\x00", "whole"])
+def test_what_cannot_be_read_was_not_recorded(run, text):
+    folder = run()
+    evaluate_run(folder, "crnerf-full@R2")
+    path = folder / "eval" / "crnerf-full@R2" / STEP / "metrics.json"
+    if text == "whole":
+        assert recorded(folder, "crnerf-full@R2", checkpoint_of(folder)) == json.loads(path.read_text())
+        text = path.read_text()[:-9]
+    path.write_text(text)
+    assert recorded(folder, "crnerf-full@R2", checkpoint_of(folder)) is None
+
+
 def test_twice_is_the_same(run):
     folder = run()
     first, again = (evaluate_run(folder, "crnerf-full@R2") for _ in range(2))
     assert first["images"] == again["images"]
+
+
+# Tasks
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory):
+    """Runs of three test photos: `crossray`, whose views protocols share, and `nerfw`, whose codes they share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tiny_run, "SPLITS", ("train", "test", "train", "test", "val", "test"))
+        folder = cut_tiny(tmp_path_factory.mktemp("several"))
+        patch.setenv("CROSSRAY_CACHE", str(folder / "cache"))
+        for method in ("crossray", "nerfw"):
+            over = {"name": method, "train": {"epochs": 1, "steps_per_epoch": 2}, "model": {"field": "hash"}}
+            job = tiny_job(folder, method, over)
+            claim_run(job)
+            train(job, Context())
+    return folder
+
+
+@pytest.mark.parametrize("method", ["crossray", "nerfw"])
+def test_the_numbers_are_the_same_however_views_are_split(several, quick, method, monkeypatch):
+    monkeypatch.setenv("CROSSRAY_CACHE", str(several / "cache"))
+    run = several / "runs" / method
+    names = ["crnerf-full@R2", "crnerf-full@R2+affine", "nerfw-half@R2"]
+    evaluation = prepare(job_of(run), checkpoint_of(run), names)
+    split = evaluation.begin()
+    assert [task.photos for task in split] == [(1,), (3,), (5,)]
+    at_once = score_views(split[0]._replace(photos=(1, 3, 5)))
+    parts = [score_views(task) for task in reversed(split)]
+    for name in names:
+        assert at_once.rows[name] == {index: row for part in parts for index, row in part.rows[name].items()}
+        alone = score_views(split[1]._replace(protocols=(name,)))
+        assert alone.rows[name][3] == at_once.rows[name][3]  # nor do other protocols change a number
+    results = [{k: v for k, v in r.items() if k != "seconds"} for r in evaluation.commit(parts)]
+    again = [{k: v for k, v in r.items() if k != "seconds"} for r in evaluation.commit([at_once])]
+    assert results == again
+    assert [row["name"] for row in results[0]["images"]] == ["photo_001.jpg", "photo_003.jpg", "photo_005.jpg"]
+
+
+def test_the_mapper_runs_the_tasks_and_a_task_reads_the_model_once(several, monkeypatch):
+    monkeypatch.setenv("CROSSRAY_CACHE", str(several / "cache"))
+    run, read, ran = several / "runs" / "crossray", [], []
+    model_of = module.model_of
+    monkeypatch.setattr(module, "model_of", lambda *words: read.append(1) or model_of(*words))
+    module._latest.clear()
+
+    def mapper(fn, specs):
+        for spec in reversed(list(specs)):
+            ran.append(spec.photos)
+            yield fn(spec)
+
+    (result,) = evaluate_protocols(run, ["crnerf-full@R2"], mapper=mapper)
+    assert ran == [(5,), (3,), (1,)]
+    assert len(read) == 1
+    assert result["images"] == evaluate_run(run, "crnerf-full@R2")["images"]
+
+
+def test_a_view_is_rendered_once_for_all_protocols(several, monkeypatch):
+    monkeypatch.setenv("CROSSRAY_CACHE", str(several / "cache"))
+    rendered, render_view = [], module.render_view
+    monkeypatch.setattr(module, "render_view", lambda *a, **k: rendered.append(1) or render_view(*a, **k))
+    evaluate_protocols(several / "runs" / "crossray", ["crnerf-full@R2", "nerfw-half@R2", "nerfw-half@R2+affine"])
+    assert len(rendered) == 3
+
+
+def test_a_checkpoint_that_was_removed_or_written_anew_is_told_apart(run):
+    folder = run()
+    (task,) = prepare(job_of(folder), checkpoint_of(folder), ["crnerf-full@R2"]).begin()
+    module._latest.clear()
+    with pytest.raises(CheckpointGone, match="written anew"):
+        score_views(task._replace(checkpoint="0" * 64))
+    (folder / "checkpoints" / STEP / "model.safetensors").write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match="damaged") as error:
+        score_views(task)
+    assert not isinstance(error.value, CheckpointGone)
+    shutil.rmtree(folder / "checkpoints" / STEP)
+    with pytest.raises(CheckpointGone, match="removed"):
+        score_views(task)
+
+
+def test_evaluations_after_training_wait_for_the_process_that_is_at_it(run, monkeypatch):
+    """And then find that there is nothing to do."""
+    folder = run()
+    result = evaluate_run(folder, "crnerf-full@R2")
+    path = folder / "eval" / "crnerf-full@R2" / STEP / "metrics.json"
+    text = path.read_text()
+    path.unlink()
+    job = job_of(folder)
+    job = job.model_copy(update={"evaluate": job.evaluate.model_copy(update={"protocols": ("crnerf-full@R2",)})})
+    said, lock = [], lock_of(folder, STEP)
+
+    def other(*words):  # ends as soon as somebody waits for it
+        said.append(words[0])
+        path.write_text(text)
+        lock.release()
+
+    monkeypatch.setattr(module.log, "info", other)
+    lock.acquire()
+    monkeypatch.setattr(module, "score_views", None)
+    assert run_protocols(job) == [result]
+    assert "another process" in said[0]
 
 
 def test_a_moved_run_finds_its_own_checkpoints_and_shards(run, trained):
@@ -334,14 +480,9 @@ def test_a_fitted_code_knows_nothing_of_the_right_half(trained, photos, quick, n
     assert not torch.equal(code, other)
 
 
-def test_a_code_is_fitted_once_a_photo_and_checkpoint(run, quick, photos):
+def test_a_code_is_fitted_once_a_photo_and_checkpoint(run, quick):
     folder = run("nerfw")
-    (index,) = photos.indices("test")
-    codes = {}
-    first = evaluate_run(folder, "crnerf-full@R2", codes=codes)
-    (fitted,) = codes.values()  # of one checkpoint and recipe
-    assert fitted.keys() == {(index, "left")}
-    shared = evaluate_run(folder, "nerfw-half@R2", codes=codes)
+    first, shared = evaluate_protocols(folder, ["crnerf-full@R2", "nerfw-half@R2"])
     assert len(quick) == 1
     assert evaluate_run(folder, "nerfw-half@R2")["images"] == shared["images"]  # fitted anew
     assert len(quick) == 2

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from tiny_scene import write_tiny_scene
 
-from pipeline.launch.tasks import in_process, ray_tasks
+from pipeline.errors import CrossrayError
+from pipeline.launch.tasks import PRIVATE_RAY, TaskError, _fitting, in_process, ray_session, ray_tasks
 from pipeline.patches import PatchPlan
 from pipeline.shards import ShardError, cut_shards, write_shard
 
@@ -45,6 +48,80 @@ def test_in_process_yields_each_result_as_it_is_made():
         list(in_process(refuse, [7]))
 
 
+def where(x):
+    return Path.cwd()
+
+
+def test_a_share_of_a_gpu_is_a_need_like_any_other():
+    nodes = [{"CPU": 4.0, "GPU": 1.0}, {"CPU": 8.0}]
+    assert _fitting({"num_cpus": 1, "num_gpus": 0.25}, nodes) == {"num_cpus": 1, "num_gpus": 0.25}
+    assert _fitting({"num_cpus": 16}, nodes) == {"num_cpus": 8}
+    with pytest.raises(TaskError, match=r"needs 2 GPUs, and Ray's largest node has 1"):
+        _fitting({"num_cpus": 0, "num_gpus": 2}, nodes)
+    with pytest.raises(TaskError, match=r"needs 0\.25 GPUs, and Ray's largest node has 0"):
+        _fitting({"num_cpus": 0, "num_gpus": 0.25}, nodes[1:])
+
+
+def join(address: str, **environment: str) -> str:
+    """What a process gets that connects to a Ray with these variables."""
+    code = f"import ray; ray.init(address={address!r}, log_to_driver=False); print('joined')"
+    clean = {k: v for k, v in os.environ.items() if k not in ("RAY_AUTH_TOKEN", "RAY_AUTH_MODE")}
+    clean["RAY_NUM_REDIS_GET_RETRIES"] = "1"  # Ray asks twenty times, a second each
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean | environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    return done.stdout + done.stderr
+
+
+def test_a_cluster_that_does_not_answer_is_named(monkeypatch):
+    import ray
+
+    def refuse(**options):
+        raise ConnectionError("Could not find any running Ray instance")
+
+    monkeypatch.setenv("RAY_ADDRESS", "10.1.2.3:6379")
+    monkeypatch.setattr(ray, "init", refuse)
+    with (
+        pytest.raises(CrossrayError, match=r"RAY_ADDRESS: no Ray cluster at 10\.1\.2\.3:6379 .*RAY_AUTH_TOKEN"),
+        ray_session(),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_a_private_ray_works_where_the_driver_is_and_for_nobody_without_its_token(tmp_path, monkeypatch):
+    import ray
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    for name in ("home", "here"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # workers import this module by name
+    names = (*PRIVATE_RAY, "RAY_AUTH_MODE", "RAY_AUTH_TOKEN")
+    before = {name: os.environ.get(name) for name in names}
+    with ray_session(num_cpus=1):
+        address, token = ray.get_runtime_context().gcs_address, os.environ["RAY_AUTH_TOKEN"]
+        assert len(token) == 64
+        assert "joined" in join(address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=token)
+        for stranger in ({"RAY_AUTH_MODE": "disabled"}, {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}):
+            answer = join(address, **stranger)
+            assert "joined" not in answer
+            assert "InvalidAuthToken" in answer
+        monkeypatch.chdir(tmp_path / "here")
+        with ray_tasks() as mapper:
+            assert list(mapper(where, [1])) == [tmp_path / "here"]
+            (tmp_path / "here").rename(tmp_path / "gone")
+            monkeypatch.setattr(Path, "cwd", lambda: tmp_path / "here")  # a driver whose folder other nodes lack
+            with pytest.raises(CrossrayError, match=r"^node \S+ has no folder \S+/here .*CROSSRAY_HOME"):
+                list(mapper(double, [1]))
+        session = Path(ray._private.worker._global_node.get_temp_dir_path())
+        files = [p for folder in (session, tmp_path) for p in folder.rglob("*") if p.is_file()]
+        assert len(files) > 10
+        assert [path for path in files if token.encode() in path.read_bytes()] == []
+    assert {name: os.environ.get(name) for name in names} == before
+    assert list((tmp_path / "home").iterdir()) == []
+
+
 @pytest.mark.slow
 def test_ray_tasks_survive_a_killed_process_and_give_the_same_bytes(tmp_path, monkeypatch):
     import ray
@@ -54,7 +131,6 @@ def test_ray_tasks_survive_a_killed_process_and_give_the_same_bytes(tmp_path, mo
     root = write_tiny_scene(tmp_path / "tiny", photos=10)
     plan = PatchPlan(size=4)
     expected = cut_shards(root, tmp_path / "here", downscale=2, plan=plan, mapper=in_process)
-    token_before = (Path.home() / ".ray").exists()
     handler = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
         with ray_tasks(num_cpus=2) as mapper:
@@ -83,4 +159,3 @@ def test_ray_tasks_survive_a_killed_process_and_give_the_same_bytes(tmp_path, mo
     assert dying == expected
     assert contents(tmp_path / "ray") == contents(tmp_path / "here")
     assert not folder.exists()
-    assert (Path.home() / ".ray").exists() == token_before
