@@ -15,24 +15,18 @@ import json
 import logging
 import os
 import platform
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cache
-from importlib.resources import files
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
 from filelock import FileLock, Timeout
 from PIL import Image
-from pydantic import BaseModel, ConfigDict
 
-from model.methods import ModelSpec, smallest_side
 from model.scene_model import SceneModel
 from pipeline.best import write_best
 from pipeline.board import write_evaluation
@@ -44,139 +38,30 @@ from pipeline.checkpoint import (
     committed,
     digest,
     folder_name,
-    latest_checkpoint,
     read_checkpoint,
 )
-from pipeline.config import Job, load_job
+from pipeline.config import Job
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write
-from pipeline.fit import FitRecipe, fit_code
-from pipeline.landmark import Landmark
-from pipeline.lpips import LPIPS, VARIABLE, find_lpips, read_lpips
-from pipeline.metrics import psnr, ssim_11, ssim_window3, to_8bit
-from pipeline.photos import Photos, open_photos
+from pipeline.judge import Judge, Shared, depth_picture, fit_colours, lpips_at, lpips_usable
+from pipeline.lpips import LPIPS, VARIABLE
+from pipeline.metrics import to_8bit
+from pipeline.photos import Photos
 from pipeline.progress import Progress
-from pipeline.render import View, colour_view, read_appearance, render_picture, render_view
+from pipeline.protocol import appearance_from, check_protocol, parse_protocol, samples_of
+from pipeline.runs import checkpoint_of, job_of, model_of, photos_of
 from pipeline.train import device_name
-from pipeline.truth import check_truth, elsewhere, mask_iou, reduced, truth_of
+from pipeline.truth import truth_of
 
 log = logging.getLogger("crossray")
 
 METRICS = "metrics.json"
-LPIPS_SIDE = 31  # pixels; AlexNet has nothing left of a smaller picture
-AFFINE = "+affine"  # suffix of the control: colours fitted to the photo's left half by one affine map
-MASK_PHOTOS = 32  # training photos over which masks are compared with the truth, at most
 
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 class CheckpointGone(CheckpointError):
     """The checkpoint was removed, or written anew, while it was being evaluated: nothing is wrong with the run."""
-
-
-class Protocol(BaseModel):
-    """What is read, what is scored, and how (one file each in pipeline/protocols)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    appearance: Literal["whole", "left", "elsewhere"]
-    scored: Literal["right", "whole"]
-    truth: Literal["photo", "clean"]
-    rounding: Literal["truncate", "round"]
-    ssim: Literal["window3", "window11"]
-    mlp_samples: tuple[int, int]
-    fit: dict[Literal["mlp", "hash"], FitRecipe]
-
-
-def parse_protocol(name: str) -> tuple[Protocol, int, bool]:
-    """`crnerf-full@R4[+affine]` -> protocol, downscale, whether the affine control is asked for.
-
-    Raises:
-        CrossrayError: an unknown name, or one without its downscale.
-    """
-    known = sorted(
-        p.name.removesuffix(".yaml") for p in files("pipeline.protocols").iterdir() if p.name.endswith(".yaml")
-    )
-    match = re.fullmatch(r"([a-z0-9-]+)@R([1-9][0-9]*)(\+affine)?", name)
-    if match is None:
-        raise CrossrayError(
-            f"protocol {name!r}: write a protocol with its downscale, for example {known[0]}@R4 "
-            f"(known: {', '.join(known)}; a trailing {AFFINE} adds the affine control)"
-        )
-    if match[1] not in known:
-        raise CrossrayError(f"protocol {match[1]!r} is not known (known: {', '.join(known)})")
-    text = files("pipeline.protocols").joinpath(f"{match[1]}.yaml").read_text()
-    protocol, affine = Protocol.model_validate(yaml.safe_load(text)), match[3] is not None
-    if affine and protocol.appearance == "elsewhere":
-        raise CrossrayError(f"protocol {name}: the affine control looks at the scored photo, which {match[1]} forbids")
-    return protocol, int(match[2]), affine
-
-
-def job_of(run: Path) -> Job:
-    """The job of a run's folder. A run that was moved is where it is now; its shards stay where they were.
-
-    Raises:
-        CrossrayError: no such run.
-    """
-    if not (run / "job.yaml").is_file():
-        raise CrossrayError(f"{run} is not a run: it has no job.yaml")
-    job, folder = load_job(run / "job.yaml"), run.resolve()
-    scene = job.scene.model_copy(update={"shards": job.shards})
-    return job.model_copy(update={"runs": folder.parent, "name": folder.name, "scene": scene})
-
-
-def checkpoint_of(run: Path, step: int | None = None) -> Checkpoint:
-    """A run's checkpoint of `step`, by default the newest whole one.
-
-    Raises:
-        CheckpointError: there is none, or it is damaged.
-    """
-    if step is None:
-        checkpoint = latest_checkpoint(run / "checkpoints")
-        if checkpoint is None:
-            raise CheckpointError(f"{run / 'checkpoints'}: no committed checkpoint; has the run been trained?")
-        return checkpoint
-    steps = [int(p.name.removeprefix("step-")) for p in committed(run / "checkpoints")]
-    if step not in steps:
-        raise CheckpointError(f"{run}: no checkpoint of step {step}; there are {', '.join(map(str, steps)) or 'none'}")
-    return read_checkpoint(run / "checkpoints" / folder_name(step))
-
-
-def model_of(job: Job, checkpoint: Checkpoint, device: torch.device | None = None) -> SceneModel:
-    """A checkpoint's model in evaluation mode; by default on the GPU that this process has, if the job wants one."""
-    torch.backends.cudnn.allow_tf32 = False  # as in training
-    device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
-    box = torch.zeros(2, 3)  # the scene's box is one of its buffers
-    model = SceneModel(job.model, box, checkpoint.meta["photos"]).to(device).requires_grad_(False)
-    model.load_state_dict(checkpoint.model)
-    return model.eval()
-
-
-def load_run(
-    run: Path, step: int | None = None, device: torch.device | None = None
-) -> tuple[Job, SceneModel, Checkpoint]:
-    """A run's job, its model in evaluation mode, and the checkpoint that it was read from (the newest, or `step`).
-
-    Raises:
-        CrossrayError: no such run, or no usable checkpoint in it.
-    """
-    job, checkpoint = job_of(run), checkpoint_of(run, step)
-    return job, model_of(job, checkpoint, device), checkpoint
-
-
-def photos_of(job: Job, checkpoint: Checkpoint) -> Photos:
-    """The photos that a checkpoint was trained on.
-
-    Raises:
-        CrossrayError: the job's shards hold other ones, or cannot be read.
-    """
-    photos = open_photos(job.shards)
-    if photos.manifest.content_hash != checkpoint.meta["shards"]:
-        raise CrossrayError(
-            f"{job.shards}: other photos or masks than {job.run} was trained on; --set scene.shards=... in a new run, "
-            "or cut the shards again as they were"
-        )
-    return photos
 
 
 # --------------------------------------------------------------------------------------------------------- tasks
@@ -215,11 +100,7 @@ def score_views(task: Views) -> Scores:
     """
     with threads_of(task.job):
         model, photos = loaded(task)
-        lpips = None
-        if task.lpips:
-            lpips = read_lpips(task.weights) if task.weights else find_lpips()
-            if lpips is None:
-                raise CrossrayError("LPIPS: the weights that were found before are not on this machine")
+        lpips = lpips_at(task.weights) if task.lpips else None
         judges, shared = {}, Shared()
         for name in task.protocols:
             protocol = parse_protocol(name)[0]
@@ -496,208 +377,10 @@ def described(target: Path) -> Checkpoint:
 # --------------------------------------------------------------------------------------------------------- judging
 
 
-@dataclass
-class Shared:
-    """What the protocols of one checkpoint need not do twice."""
-
-    codes: dict[tuple[FitRecipe, int, str], torch.Tensor] = field(default_factory=dict)
-    """(recipe, photo, what it was read from) -> fitted code."""
-    views: dict[tuple[int, tuple[int, int] | None], View] = field(default_factory=dict)
-    """(photo, samples) -> view, of the latest photo alone: it takes as much memory as all else."""
-
-
-class Judge:
-    """One model under one protocol: what it may see of a test photo, and what its picture is compared with.
-
-    Args:
-        landmark: the truth behind the photos, for a protocol that scores against it.
-        shared: with the judges of the same model under other protocols.
-    """
-
-    def __init__(
-        self,
-        model: SceneModel,
-        photos: Photos,
-        protocol: Protocol,
-        landmark: Landmark | None,
-        shared: Shared | None = None,
-    ) -> None:
-        self.model, self.photos, self.protocol, self.landmark = model, photos, protocol, landmark
-        self.shared = shared or Shared()
-        self.appearance_from = appearance_from(model.spec, protocol)
-
-    def render(self, index: int) -> tuple[View, np.ndarray]:
-        """A test photo's view in the appearance that the protocol lets the model see."""
-        camera, appearance = self.photos.records[index], self.appearance(index)
-        samples = samples_of(self.model.spec, self.protocol)
-        if self.model.coded:  # the field itself reads the appearance: another view for each
-            return render_picture(self.model, camera, appearance, samples)
-        key = (index, samples)
-        if key not in self.shared.views:
-            self.shared.views.clear()
-            self.shared.views[key] = render_view(self.model, camera, samples=samples)
-        view = self.shared.views[key]
-        return view, colour_view(self.model, view, appearance)
-
-    def appearance(self, index: int) -> torch.Tensor | None:
-        """F^a of a test photo."""
-        if self.model.spec.appearance == "none":
-            return None
-        source, image, reference = index, self.photos.image(index), self.photos.reference(index)
-        if self.protocol.appearance == "elsewhere":
-            source = elsewhere(self.photos, index)
-            image = self.clean(source, index)
-            reference = reduced(image, self.photos.manifest.reference_downscale)
-        if self.appearance_from == "left":
-            reference = left_half(reference)
-        if self.model.embedding is None:
-            self.check_reference(reference, index)
-            return read_appearance(self.model, reference)
-        codes, key = self.shared.codes, (self.recipe, index, self.appearance_from)
-        if key not in codes:
-            columns = left_half(image).shape[1] if self.appearance_from == "left" else image.shape[1]
-            camera = self.photos.records[source]
-            codes[key] = fit_code(self.model, image, camera, columns, self.recipe, seed=index)
-        return codes[key]
-
-    def check_reference(self, reference: np.ndarray, index: int) -> None:
-        """CrossrayError where what may be seen of a photo is too small for the appearance network."""
-        least, (height, width) = smallest_side(self.model.spec), reference.shape[:2]
-        if min(height, width) < least:
-            raise CrossrayError(
-                f"{self.photos.records[index].name}: {width} x {height} pixels of its reference may be read "
-                f"({self.appearance_from}), and model.encoder: released reads no side under {least}; cut the shards "
-                "with a smaller scene.reference_downscale"
-            )
-
-    @property
-    def recipe(self) -> FitRecipe:
-        """How codes are fitted."""
-        return self.protocol.fit[self.model.spec.field]
-
-    def clean(self, view: int, light: int) -> np.ndarray:
-        """The landmark in the view of one photo and the light of another, nobody there."""
-        assert self.landmark is not None
-        return self.landmark.truth(self.photos.records[view].name, self.photos.records[light].name)
-
-    def score(self, prediction: np.ndarray, index: int, lpips: LPIPS | None) -> dict[str, Any]:
-        """The metrics of one 8-bit prediction."""
-        truth = self.photos.image(index) if self.protocol.truth == "photo" else self.clean(index, index)
-        name, key = self.photos.records[index].name, self.photos.records[index].key
-        return {"name": name, "key": key, **score(prediction, truth, self.protocol, lpips, name)}
-
-    def masks(self) -> dict[str, float]:
-        """Where the truth is known: how well the model's masks agree with it, on training photos. Masks that were
-        given to the model are none of its own."""
-        if self.landmark is None or self.model.spec.transient == "fixed":
-            return {}
-        train = self.photos.indices("train")
-        iou = mask_iou(self.model, self.photos, self.landmark, train[:: -(-len(train) // MASK_PHOTOS)])
-        return {} if iou is None else {"mask_iou": iou}
-
-
-def appearance_from(spec: ModelSpec, protocol: Protocol) -> str:
-    """What appearances are read from. A learned code is fitted, which on scored pixels would be training on them: so it
-    sees the left half where others see the whole photo."""
-    if spec.appearance == "none":
-        return "nothing"
-    fitted = spec.appearance == "embedding" and protocol.appearance == "whole"
-    return "left" if fitted else protocol.appearance
-
-
-def left_half(picture: np.ndarray) -> np.ndarray:
-    """The left half of (h, w, ...), with the middle column where the width is odd."""
-    return picture[:, : picture.shape[1] - picture.shape[1] // 2]
-
-
-def lpips_usable(photos: Photos, indices: tuple[int, ...], protocol: Protocol) -> bool:
-    """Whether the weights of LPIPS are found and all pictures are large enough; if not, the log says why."""
-    if find_lpips() is None:
-        warn_once(f"LPIPS is left out: no weights found; {VARIABLE}=/path/to/lpips_alex.npz names them")
-        return False
-    for record in (photos.records[i] for i in indices):
-        width = record.width // 2 if protocol.scored == "right" else record.width
-        if min(record.height, width) < LPIPS_SIDE:
-            warn_once(f"LPIPS is left out: what is scored of {record.name} has a side under {LPIPS_SIDE} pixels")
-            return False
-    return True
-
-
-@cache
-def warn_once(text: str) -> None:
-    """A warning that several evaluations share."""
-    log.warning(text)
-
-
-def samples_of(spec: ModelSpec, protocol: Protocol) -> tuple[int, int] | None:
-    """Sample counts of the rendering; None keeps those of training (the protocols only speak of the MLP field)."""
-    return protocol.mlp_samples if spec.field == "mlp" else None
-
-
-def score(
-    prediction: np.ndarray, truth: np.ndarray, protocol: Protocol, lpips: LPIPS | None, name: str
-) -> dict[str, float]:
-    """The metrics of one 8-bit prediction against the 8-bit truth, both (h, w, 3); `name` is for messages."""
-    start = truth.shape[1] // 2 if protocol.scored == "right" else 0
-    prediction, truth = np.ascontiguousarray(prediction[:, start:]), np.ascontiguousarray(truth[:, start:])
-    ssim, least = (ssim_window3, 3) if protocol.ssim == "window3" else (ssim_11, 11)
-    if min(truth.shape[:2]) < least:
-        raise CrossrayError(
-            f"{name}: its scored part is {truth.shape[1]} x {truth.shape[0]} pixels, smaller "
-            f"than the SSIM window of {least}; evaluate at a smaller downscale"
-        )
-    scores = {"psnr": psnr(prediction, truth), "ssim": ssim(prediction, truth)}
-    return scores if lpips is None else scores | {"lpips": lpips.distance(prediction, truth)}
-
-
-def fit_colours(picture: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """`picture` (h, w, 3) in [0, 1] through the affine colour map that fits the photo's left half best.
-
-    The honest control for every appearance model: least squares over the left half, 12 numbers, nothing learned.
-    """
-    left = photo.shape[1] - photo.shape[1] // 2
-    ones = np.ones((*picture.shape[:2], 1))
-    inputs = np.concatenate([picture, ones], axis=-1)
-    target = photo[:, :left].reshape(-1, 3) / 255
-    solution, *_ = np.linalg.lstsq(inputs[:, :left].reshape(-1, 4), target, rcond=None)
-    return np.clip(inputs @ solution, 0, 1)
-
-
-def depth_picture(view: View) -> np.ndarray:
-    """Depth as uint8 (h, w): near is bright, nothing is black."""
-    depth = view.depth / view.accumulation.clamp(min=1e-3)
-    near, far = torch.quantile(depth.flatten()[:1_000_000], torch.tensor([0.01, 0.99], device=depth.device))
-    bright = (1 - 0.85 * ((depth - near) / (far - near).clamp(min=1e-6)).clamp(0, 1)) * view.accumulation.clamp(0, 1)
-    return (255 * bright).round().byte().cpu().numpy()
-
-
 def save_png(path: Path, picture: np.ndarray) -> None:
     """A uint8 picture as PNG."""
     with atomic_file(path) as file:
         Image.fromarray(picture).save(file, format="PNG")
-
-
-def check_downscale(job: Job, protocol_name: str, downscale: int) -> None:
-    """CrossrayError where a protocol's pictures are not of the size of the job's photos."""
-    if downscale != job.scene.downscale:
-        raise CrossrayError(
-            f"protocol {protocol_name}: the photos of {job.name} are at R{job.scene.downscale}; "
-            f"evaluate under {protocol_name.split('@')[0]}@R{job.scene.downscale}, or train at R{downscale}"
-        )
-
-
-def check_protocol(job: Job, name: str) -> None:
-    """CrossrayError where a job's runs cannot be evaluated under a protocol."""
-    protocol, downscale, _ = parse_protocol(name)
-    check_downscale(job, name, downscale)
-    if protocol.truth == "clean":
-        check_truth(job)
-
-
-def check_protocols(job: Job) -> None:
-    """CrossrayError for a protocol that could only be refused after the training."""
-    for name in job.evaluate.protocols:
-        check_protocol(job, name)
 
 
 def recorded(run: Path, protocol_name: str, checkpoint: Checkpoint) -> dict[str, Any] | None:

@@ -21,14 +21,15 @@ from rich.table import Table
 from model.scene_model import SceneModel
 from pipeline.config import Job, make_job, save_job
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import depth_picture, load_run
 from pipeline.files import atomic_write
+from pipeline.judge import depth_picture
 from pipeline.landmark import Landmark, write_landmark
 from pipeline.metrics import psnr, ssim_11, to_8bit
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import shown
 from pipeline.render import View, colour_view, predicted_mask, read_appearance, render_view
 from pipeline.report import Row, write_overview, write_report
+from pipeline.runs import load_run
 from pipeline.shards import cut_shards
 from pipeline.truth import mask_iou
 

@@ -29,16 +29,15 @@ from pipeline.evaluate import (
     Mapper,
     Scores,
     Views,
-    check_protocol,
     described,
-    job_of,
     lock_of,
-    parse_protocol,
     prepare,
     recorded,
     score_views,
     update_best,
 )
+from pipeline.protocol import check_protocol, parse_protocol
+from pipeline.runs import job_of
 
 log = logging.getLogger("crossray")
 

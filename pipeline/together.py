@@ -12,6 +12,7 @@ import torch
 import torch.distributed as dist
 
 from model.scene_model import SceneModel
+from pipeline.best import best_steps
 from pipeline.checkpoint import committed, prune, save_checkpoint
 from pipeline.clock import Speed
 from pipeline.record import GRADIENT, LossRecord
@@ -65,7 +66,7 @@ def save(
     if problem:
         log.error("step %d cannot be saved: %s; training goes on and tries again at the next checkpoint", step, problem)
     elif work.context.rank == 0:
-        prune(folder, job.train.keep_checkpoints)
+        prune(folder, job.train.keep_checkpoints, best_steps(job.run))
     speed.wait(time.perf_counter() - began)
 
 

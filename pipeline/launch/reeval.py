@@ -11,9 +11,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from typing import Any, cast
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
 
 from pipeline.config import Job
 from pipeline.errors import CrossrayError
@@ -78,13 +78,15 @@ def tasks_for(reeval: ReevalJob) -> AbstractContextManager[Mapper]:
 
 @contextmanager
 def evaluation_tasks(
-    gpus: float | None = None, died: Callable[[Any, TaskError], Any] | None = None
+    gpus: float | None = None,
+    died: Callable[[Any, TaskError], Any] | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Mapper]:
     """A mapper that evaluates views as Ray tasks.
 
     Args:
         gpus: share of a GPU that a task takes, instead of what the job of its run says.
-        died: as in `ray_tasks`.
+        died, stop: as in `ray_tasks`.
     """
     with ray_session():
         import ray
@@ -92,7 +94,7 @@ def evaluation_tasks(
         def needs(task: Any) -> dict[str, float]:
             return needs_of_evaluation(task.job, gpus, ray.cluster_resources().get("GPU", 0))
 
-        with ray_tasks(needs=needs, died=died) as mapper:
+        with ray_tasks(needs=needs, died=died, stop=stop) as mapper:
             yield mapper
 
 
@@ -139,9 +141,9 @@ class EachCheckpoint(threading.Thread):
     def run(self) -> None:
         """See the class."""
         try:
-            with evaluation_tasks(died=lost) as mapper:
+            with evaluation_tasks(died=lost, stop=self.ended.is_set) as mapper:
                 while not self.ended.wait(POLL):
-                    self.evaluate_new(self.until_stopped(mapper))
+                    self.evaluate_new(mapper)
         except Exception as error:
             log.warning("%s: its checkpoints are not evaluated any more (%s)", self.job.run, error)
 
@@ -155,22 +157,19 @@ class EachCheckpoint(threading.Thread):
         for line in summary.failed:
             log.warning("not evaluated: %s", line)
 
-    def until_stopped(self, mapper: Mapper) -> Mapper:
-        """`mapper`, whose results end when the thread is asked to stop."""
-
-        def mapped(fn: Callable[[Any], Any], specs: Iterable[Any]) -> Iterator[Any]:
-            with closing(cast(Generator[Any, None, None], mapper(fn, specs))) as results:
-                for result in results:
-                    if self.ended.is_set():
-                        return
-                    yield result
-
-        return mapped
-
     def stop(self, patience: float = 15.0) -> None:
         """Begin nothing more, cancel what is under way, and wait for that."""
         self.ended.set()
         self.join(patience)
+
+
+def evaluate_rest(job: Job) -> None:
+    """Evaluate the checkpoints for which the ranks have left nothing free, once they are gone."""
+    summary = Summary()
+    with evaluation_tasks(died=lost) as mapper:
+        evaluate_all(look(job.run, job.evaluate.protocols, summary), mapper, summary)
+    for line in summary.failed:
+        log.warning("not evaluated: %s", line)
 
 
 @contextmanager

@@ -13,14 +13,15 @@ from filelock import FileLock
 
 from pipeline.config import BOOKKEEPING, Job, flatten, save_job
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import check_protocols, run_protocols
+from pipeline.evaluate import run_protocols
 from pipeline.heartbeat import Heartbeat, driver_path
 from pipeline.launch.local import run_local
-from pipeline.launch.reeval import each_checkpoint, evaluation_tasks
+from pipeline.launch.reeval import each_checkpoint, evaluate_rest, evaluation_tasks
 from pipeline.launch.tasks import ray_session, ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
 from pipeline.masks import read_record
 from pipeline.progress import shown
+from pipeline.protocol import check_protocols
 from pipeline.scene import Scene, read_scene
 from pipeline.shards import Manifest, cut_shards, mask_path, masks_hash, read_manifest, scene_record
 
@@ -75,6 +76,8 @@ def run_on_ray(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         if not trained["finished"]:
             return trained, []
         enter(job, "evaluating")
+        if job.evaluate.each_checkpoint:
+            evaluate_rest(job)
         with evaluation_tasks() as mapper:
             return trained, run_protocols(job, mapper)
 

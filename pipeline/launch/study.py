@@ -22,12 +22,12 @@ from typing import Any
 from pipeline.checkpoint import committed
 from pipeline.config import save_job
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import check_protocols
 from pipeline.files import atomic_write
 from pipeline.launch.process import Outcome, Spec, run_one
 from pipeline.launch.run import claim_run, ensure_shards
 from pipeline.launch.tasks import Mapper, ray_tasks
 from pipeline.launch.torchrun import StopFlag, pick_device
+from pipeline.protocol import check_protocols
 from pipeline.study import Run, StudyJob, Table, expand, make_tables, result_of, write_results
 from pipeline.train import checkpoints
 

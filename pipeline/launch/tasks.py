@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -53,7 +54,10 @@ def one_cpu(spec: Any) -> dict[str, float]:
 
 @contextmanager
 def ray_tasks(
-    num_cpus: int | None = None, needs: Needs = one_cpu, died: Callable[[Any, TaskError], Any] | None = None
+    num_cpus: int | None = None,
+    needs: Needs = one_cpu,
+    died: Callable[[Any, TaskError], Any] | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Mapper]:
     """A mapper that runs each spec as a Ray task in this process's folder, restarted up to `RETRIES` times if its
     process dies.
@@ -63,9 +67,10 @@ def ray_tasks(
         needs: what a spec's task takes; no more CPUs are asked for than the largest node has.
         died: gives the result of a spec whose process died again and again; by default that is a TaskError,
             which ends the iteration.
+        stop: asked every second; once it says so, the results end, and what is under way is cancelled.
     """
     with ray_session(num_cpus):
-        yield partial(_map_tasks, needs=needs, died=died)
+        yield partial(_map_tasks, needs=needs, died=died, stop=stop)
 
 
 @contextmanager
@@ -95,8 +100,9 @@ def _joined(address: str) -> Iterator[None]:
     import ray
 
     try:
+        _knock(address)
         _init_ray(address=address)
-    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+    except (OSError, ray.exceptions.AuthenticationError) as error:
         raise CrossrayError(
             f"RAY_ADDRESS: no Ray cluster at {address} takes this process in ({error}). Is it running? One that was "
             "started with a token needs RAY_AUTH_MODE=token, and the token in RAY_AUTH_TOKEN or in the file that "
@@ -106,6 +112,13 @@ def _joined(address: str) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """OSError where nobody listens at host:port; Ray would ask for minutes."""
+    host, _, port = address.rpartition(":")
+    if port.isdigit() and "://" not in host:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
 
 
 @contextmanager
@@ -167,7 +180,11 @@ def _init_ray(**options: Any) -> None:
 
 
 def _map_tasks(
-    fn: Callable[[Any], Any], specs: Iterable[Any], needs: Needs, died: Callable[[Any, TaskError], Any] | None
+    fn: Callable[[Any], Any],
+    specs: Iterable[Any],
+    needs: Needs,
+    died: Callable[[Any, TaskError], Any] | None,
+    stop: Callable[[], bool],
 ) -> Iterator[Any]:
     import ray
 
@@ -177,8 +194,10 @@ def _map_tasks(
     folder = Path.cwd()
     pending = {task.options(name=name, **_fitting(needs(spec), nodes)).remote(folder, fn, spec): spec for spec in specs}
     try:
-        while pending:
-            done, _ = ray.wait(list(pending), num_returns=1)
+        while pending and not stop():
+            done, _ = ray.wait(list(pending), num_returns=1, timeout=1)
+            if not done:
+                continue
             spec = pending.pop(done[0])
             try:
                 result = ray.get(done[0])

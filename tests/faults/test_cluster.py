@@ -39,6 +39,7 @@ SPLITS = ("train",) * 5 + ("val",) + ("test",) * VIEWS
 GRACE = 120  # seconds until Ray kills a job that was stopped
 JOB = Path("jobs") / "train_tiny.yaml"
 BIN = Path(sys.executable).parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +151,15 @@ def test_it_is_a_cluster_and_shut_to_strangers(cluster):
     sockets = [c for process in processes for c in process.net_connections() if c.status == psutil.CONN_LISTEN]
     assert len(sockets) > 5 * len(cluster.nodes)
     assert {c.laddr.ip for c in sockets} <= {"127.0.0.1", "::ffff:127.0.0.1"}
+
+
+def test_local_edits_travel_as_a_working_directory(cluster):
+    """From this project's own root, whatever else lies there; the job's home is still the cluster's."""
+    words = ["--working-dir", ".", "--", "jobs/train_scene_cpu.yaml", "--set", "scene.path=no scene"]
+    ended = run([str(BIN / "ray"), "job", "submit", *words], ROOT, cluster.env)
+    assert ended.returncode == 1, ended.stdout + ended.stderr
+    assert "scene.path: no scene is not a folder, and there are no shards in shards/no scene-R8" in ended.stdout
+    assert cluster.job(newest_id(cluster))["driver_exit_code"] == 2
 
 
 # What happens to a connection

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 from tiny_run import assert_same_bits, cut_tiny, final_state, tiny_job
 
@@ -82,6 +84,14 @@ class Driver:
     @property
     def output(self) -> str:
         return self.path.read_text()
+
+    @property
+    def ray_folder(self) -> Path:
+        """Of its private Ray, from the command lines of Ray's processes."""
+        words = " ".join(word for child in psutil.Process(self.process.pid).children() for word in child.cmdline())
+        found = re.search(r"/tmp/crossray-[^/ ]+", words)
+        assert found, words
+        return Path(found.group())
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         """Wait while the driver runs."""
@@ -156,6 +166,7 @@ def test_a_killed_driver_takes_its_ranks_along_and_the_next_one_goes_on(cut, str
     job = two_ranks(cut, "killed-driver")
     with Driver(job, tmp_path) as driver:
         driver.until_step(2 * EVERY)
+        folder = driver.ray_folder
         os.kill(driver.process.pid, signal.SIGKILL)
         assert driver.process.wait(PATIENCE) == -signal.SIGKILL
     assert len(list((job.run / "ray").iterdir())) == 1
@@ -164,3 +175,6 @@ def test_a_killed_driver_takes_its_ranks_along_and_the_next_one_goes_on(cut, str
     assert re.search(r"resuming killed-driver from step \d+", output), output
     assert not (job.run / "ray").exists()
     assert_same_run(job, straight)
+    shutil.rmtree(
+        folder
+    )  # of the killed driver's private Ray; that all of it has ended, too, the lock of the run shows

@@ -26,6 +26,9 @@ COMMANDS = (
     "shard",
     "verify",
     "run",
+    "submit",
+    "status",
+    "compare",
     "evaluate",
     "import-checkpoint",
     "methods",
@@ -216,9 +219,9 @@ def test_run_trains_says_where_and_goes_on(crossray, job_file, tmp_path):
 
 
 def test_run_evaluates_and_prints_the_scores(crossray, job_file, monkeypatch):
-    from pipeline import evaluate
+    from pipeline import judge
 
-    monkeypatch.setattr(evaluate, "find_lpips", lambda: None)
+    monkeypatch.setattr(judge, "find_lpips", lambda: None)
     path = job_file("crossray")
     status, out, _ = crossray("run", path, "--set", "evaluate.protocols=[crnerf-full@R2]")
     assert status == 0

@@ -13,29 +13,27 @@ from PIL import Image
 from tiny_run import cut_tiny, tiny_job
 
 from pipeline import evaluate as module
+from pipeline import judge
 from pipeline.checkpoint import CheckpointError
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import (
     CheckpointGone,
-    Judge,
-    checkpoint_of,
     evaluate_protocols,
     evaluate_run,
-    fit_colours,
-    job_of,
-    load_run,
     lock_of,
-    parse_protocol,
     prepare,
     recorded,
     run_protocols,
     score_views,
 )
 from pipeline.fit import FitRecipe, fit_code
+from pipeline.judge import Judge, fit_colours
 from pipeline.launch.run import claim_run
 from pipeline.metrics import ssim_11, ssim_window3
 from pipeline.photos import open_photos
+from pipeline.protocol import parse_protocol
 from pipeline.render import render_picture
+from pipeline.runs import checkpoint_of, job_of, load_run
 from pipeline.train import Context, train
 
 STEP = "step-00000006"
@@ -60,7 +58,7 @@ def trained(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _environment(trained, monkeypatch):
     monkeypatch.setenv("CROSSRAY_CACHE", str(trained / "cache"))
-    monkeypatch.setattr(module, "find_lpips", lambda: None)
+    monkeypatch.setattr(judge, "find_lpips", lambda: None)
     monkeypatch.delenv("CROSSRAY_LPIPS", raising=False)
 
 
@@ -183,7 +181,7 @@ def test_an_older_step_may_be_asked_for(run):
 def test_metrics_come_last(run, monkeypatch):
     """A folder without metrics.json is an evaluation that was interrupted."""
     folder = run()
-    monkeypatch.setattr(module, "score", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(judge, "score", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         evaluate_run(folder, "crnerf-full@R2")
     assert not list(folder.rglob("metrics.json"))
@@ -194,7 +192,7 @@ def test_results_of_another_checkpoint_go_before_its_pictures_do(run, monkeypatc
     evaluate_run(folder, "crnerf-full@R2")
     path = folder / "eval" / "crnerf-full@R2" / STEP / "metrics.json"
     whole = path.read_text()
-    monkeypatch.setattr(module, "score", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(judge, "score", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         evaluate_run(folder, "crnerf-full@R2")
     assert path.read_text() == whole  # of this very checkpoint: its pictures are the same
@@ -280,8 +278,8 @@ def test_the_mapper_runs_the_tasks_and_a_task_reads_the_model_once(several, monk
 
 def test_a_view_is_rendered_once_for_all_protocols(several, monkeypatch):
     monkeypatch.setenv("CROSSRAY_CACHE", str(several / "cache"))
-    rendered, render_view = [], module.render_view
-    monkeypatch.setattr(module, "render_view", lambda *a, **k: rendered.append(1) or render_view(*a, **k))
+    rendered, render_view = [], judge.render_view
+    monkeypatch.setattr(judge, "render_view", lambda *a, **k: rendered.append(1) or render_view(*a, **k))
     evaluate_protocols(several / "runs" / "crossray", ["crnerf-full@R2", "nerfw-half@R2", "nerfw-half@R2+affine"])
     assert len(rendered) == 3
 
@@ -417,7 +415,7 @@ def quick(monkeypatch):
         return fit_code(model, image, camera, columns, recipe, **kwargs)
 
     monkeypatch.setattr(module, "parse_protocol", parse)
-    monkeypatch.setattr(module, "fit_code", spy)
+    monkeypatch.setattr(judge, "fit_code", spy)
     return calls
 
 
@@ -557,8 +555,8 @@ def test_the_affine_control_scores_the_fitted_picture(run, photos):
 def said(monkeypatch):
     """What evaluation warns of."""
     warned: list[str] = []
-    module.warn_once.cache_clear()
-    monkeypatch.setattr(module.log, "warning", warned.append)
+    judge.warn_once.cache_clear()
+    monkeypatch.setattr(judge.log, "warning", warned.append)
     return warned
 
 
@@ -575,7 +573,7 @@ def test_lpips_is_scored_with_the_real_weights(trained, test_data, tmp_path, mon
     from pipeline.lpips import find_lpips
 
     weights = test_data / "lpips" / "lpips_alex.npz"
-    monkeypatch.setattr(module, "find_lpips", lambda: find_lpips(weights))
+    monkeypatch.setattr(judge, "find_lpips", lambda: find_lpips(weights))
     folder = cut_tiny(tmp_path, size=(140, 80))
     job = tiny_job(folder, "crossray", {"train": {"epochs": 1, "steps_per_epoch": 1}})
     claim_run(job)
@@ -596,7 +594,7 @@ def test_lpips_is_left_out_where_pictures_are_too_small(run, test_data, monkeypa
     """The scored half of the tiny photo is 25 pixels wide; AlexNet needs 31."""
     from pipeline.lpips import find_lpips
 
-    monkeypatch.setattr(module, "find_lpips", lambda: find_lpips(test_data / "lpips" / "lpips_alex.npz"))
+    monkeypatch.setattr(judge, "find_lpips", lambda: find_lpips(test_data / "lpips" / "lpips_alex.npz"))
     assert "lpips" not in evaluate_run(run(), "crnerf-full@R2")["mean"]
     assert "photo_003.jpg" in said[0]
     assert "31" in said[0]

@@ -26,10 +26,10 @@ from pipeline import cli, importing
 from pipeline.checkpoint import CheckpointError, latest_checkpoint
 from pipeline.config import Job, make_job, merge
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import load_run
 from pipeline.importing import import_checkpoint, networks
 from pipeline.photos import open_photos
 from pipeline.render import colour_view, read_appearance, render_view
+from pipeline.runs import load_run
 from pipeline.train import Context, build_model, build_optimiser, train
 
 MLP = {"width": 256, "xyz_frequencies": 15, "dir_frequencies": 4, "coarse_samples": 6, "fine_samples": 6}

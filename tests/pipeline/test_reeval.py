@@ -21,16 +21,18 @@ from tiny_run import cut_tiny, tiny_job
 
 from pipeline import cli
 from pipeline import evaluate as evaluate_module
+from pipeline import judge as judge_module
 from pipeline import reeval as module
 from pipeline.best import best_steps, write_best
 from pipeline.checkpoint import committed, prune
 from pipeline.config import JobError
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import checkpoint_of, evaluate_run, lock_of, recorded
+from pipeline.evaluate import evaluate_run, lock_of, recorded
 from pipeline.launch.reeval import EachCheckpoint, evaluation_tasks, keep_passing, needs_of_evaluation
 from pipeline.launch.run import claim_run
 from pipeline.launch.tasks import in_process, ray_session
 from pipeline.reeval import ReevalJob, find_runs, interval, load_reeval, one_pass
+from pipeline.runs import checkpoint_of
 from pipeline.train import Context, train
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -62,7 +64,7 @@ def _environment(trained, monkeypatch):
         monkeypatch.setenv(name, value)
     for name in ("RANK", "RAY_ADDRESS", "CROSSRAY_HOME", "CROSSRAY_LPIPS"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(evaluate_module, "find_lpips", lambda: None)
+    monkeypatch.setattr(judge_module, "find_lpips", lambda: None)
 
 
 @pytest.fixture
@@ -191,7 +193,7 @@ def test_a_run_without_protocols_says_so(run):
 
 
 def test_a_checkpoint_that_fails_ends_nothing(run, monkeypatch):
-    score = evaluate_module.score
+    score = judge_module.score
 
     def failing(*words):
         if len(done) == 1:
@@ -206,7 +208,7 @@ def test_a_checkpoint_that_fails_ends_nothing(run, monkeypatch):
         done.append(mine)
 
     monkeypatch.setattr(module, "finish", finish)
-    monkeypatch.setattr(evaluate_module, "score", failing)
+    monkeypatch.setattr(judge_module, "score", failing)
     summary = pass_over(run)
     assert counts(summary) == (2, 0, 0, 0, 1)
     assert re.search(r"tiny, step-00000004: RuntimeError: out of memory", summary.failed[0])
@@ -615,8 +617,15 @@ def test_what_an_evaluation_asks_ray_for(trained):
     assert needs_of_evaluation(job.model_copy(update={"device": "cpu"}), None, 4) == {"num_cpus": 2}
 
 
+def hold(seconds):
+    time.sleep(seconds)
+
+
 @pytest.mark.slow
-def test_on_ray_the_numbers_are_the_same_and_training_may_have_its_checkpoints_evaluated(run, tmp_path):
+def test_on_ray_the_numbers_are_the_same_and_training_may_have_its_checkpoints_evaluated(run, tmp_path, monkeypatch):
+    import ray
+
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # workers import this module by name
     expected = {step: evaluate_run(run, HALF, step)["images"] for step in STEPS}
     shutil.rmtree(run / "eval")
     away = shutil.move(run / "checkpoints" / name_of(6), tmp_path / name_of(6))
@@ -635,9 +644,20 @@ def test_on_ray_the_numbers_are_the_same_and_training_may_have_its_checkpoints_e
             time.sleep(0.1)
         beside.stop()
         assert not beside.is_alive()
+        shutil.rmtree(run / "eval")
+        held = ray.remote(num_cpus=2)(hold).remote(PATIENCE)  # the ranks leave nothing free
+        waiting = EachCheckpoint(job)
+        waiting.start()
+        while not waiting.tried:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        waiting.stop()
+        assert not waiting.is_alive()
+        ray.cancel(held, force=True)
+        assert not list(run.rglob("metrics.json"))
         with evaluation_tasks(died=module.lost) as mapper:
             reeval = ReevalJob(runs=(str(run),), protocols=(FULL, HALF))
-            assert counts(one_pass(reeval, mapper)) == (3, 3, 0, 0, 0)
+            assert counts(one_pass(reeval, mapper)) == (6, 0, 0, 0, 0)
     for step in STEPS:
         result = recorded(run, HALF, checkpoint_of(run, step))
         assert result is not None

@@ -34,7 +34,6 @@ from pipeline import cli
 from pipeline.checkpoint import CheckpointError, digest, latest_checkpoint, read_checkpoint, save_checkpoint
 from pipeline.config import JobError, load_job, make_job, save_job
 from pipeline.errors import CrossrayError
-from pipeline.evaluate import load_run, parse_protocol
 from pipeline.files import sha256_of
 from pipeline.importing import import_checkpoint
 from pipeline.launch.process import Spec, run_one
@@ -43,8 +42,10 @@ from pipeline.launch.tasks import in_process
 from pipeline.masks import MaskError, make_masks, read_record
 from pipeline.patches import PatchPlan
 from pipeline.photos import open_photos
+from pipeline.protocol import parse_protocol
 from pipeline.reeval import ReevalJob, find_runs, load_reeval, one_pass
 from pipeline.report import Row, write_report
+from pipeline.runs import load_run
 from pipeline.scene import SceneError, read_scene
 from pipeline.segmentation import find_segmenter
 from pipeline.shards import ShardError, cut_shards, read_manifest, read_shard, verify_shards

@@ -18,12 +18,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tiny_run import assert_same_bits, cut_tiny, final_state, tiny_job, tiny_mapping, tiny_photos, train_until
 from tiny_scene import write_tiny_scene
 
-from pipeline import evaluate
+from pipeline import judge
 from pipeline import train as module
 from pipeline.batches import check_references
 from pipeline.checkpoint import committed, latest_checkpoint, read_checkpoint, save_checkpoint
 from pipeline.config import load_job, make_job, merge
 from pipeline.errors import CrossrayError
+from pipeline.evaluate import evaluate_run
 from pipeline.launch import run as launch
 from pipeline.launch.run import claim_run, ensure_shards, run_job
 from pipeline.launch.tasks import in_process
@@ -503,11 +504,11 @@ def test_a_run_is_not_scored_on_masks_that_it_was_not_trained_on(masked):
     ensure_shards(job)
     claim_run(job)
     train(job, Context())
-    evaluate.evaluate_run(job.run, "crnerf-full@R2")
+    evaluate_run(job.run, "crnerf-full@R2")
     Image.new("L", (48, 36), 255).save(job.scene.path / "masks" / "photo_000.png")
     ensure_shards(job)
     with pytest.raises(CrossrayError, match="other photos or masks than"):
-        evaluate.evaluate_run(job.run, "crnerf-full@R2")
+        evaluate_run(job.run, "crnerf-full@R2")
 
 
 def test_numbers_that_a_closed_form_cannot_use_end_with_step_and_checkpoint(make, monkeypatch):
@@ -549,7 +550,7 @@ def test_shards_without_masks_cannot_train_on_masks(masked, tmp_path):
 
 
 def test_a_whole_job_trains_and_evaluates(make, monkeypatch):
-    monkeypatch.setattr(evaluate, "find_lpips", lambda: None)
+    monkeypatch.setattr(judge, "find_lpips", lambda: None)
     job = make("nerf", over={"evaluate": {"protocols": ["crnerf-full@R2"]}})
     trained, scores = run_job(job)
     assert trained["finished"]

@@ -23,14 +23,17 @@ from tiny_run import assert_same_bits, cut_tiny, final_state, tiny_job, tiny_pho
 from model.methods import METHODS
 from model.scene_model import SceneModel, part_of
 from pipeline import evaluate as evaluate_module
+from pipeline import judge as judge_module
 from pipeline import train as train_module
 from pipeline import work as work_module
 from pipeline.checkpoint import committed
 from pipeline.config import Job
-from pipeline.evaluate import evaluate_run, load_run, parse_protocol
+from pipeline.evaluate import evaluate_run
 from pipeline.fit import FitRecipe
 from pipeline.launch.run import claim_run
+from pipeline.protocol import parse_protocol
 from pipeline.render import predicted_mask, render_picture, training_appearance
+from pipeline.runs import load_run
 from pipeline.train import Context, checkpoints, train
 
 pytestmark = pytest.mark.slow
@@ -61,7 +64,7 @@ def cut(tmp_path_factory):
 def _environment(cut):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CROSSRAY_CACHE", str(cut / "cache"))
-        patch.setattr(evaluate_module, "find_lpips", lambda: None)
+        patch.setattr(judge_module, "find_lpips", lambda: None)
         patch.setattr(evaluate_module, "parse_protocol", quick_protocol)
         yield
 
