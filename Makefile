@@ -2,6 +2,8 @@
 # make test         everything that a machine without a cluster can show
 # make test-cluster a Ray cluster of five nodes on this machine, nodes that are lost, and the slow faults: under 30 minutes
 # make check        the fast part, for every commit
+# make test-cluster clusters of several nodes on this machine, and nodes that are lost: under 30 minutes
+# make soak         training that is killed again and again for 20 minutes
 #
 # A laptop without a GPU: `make quickstart TORCH_INDEX=https://download.pytorch.org/whl/cpu` takes torch's small CPU build.
 
@@ -11,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install quickstart test test-cluster check lint format clean
+.PHONY: install quickstart test test-cluster soak check lint format clean
 
 install: $(STAMP)
 
@@ -33,6 +35,9 @@ test: install
 
 test-cluster: install
 	$(BIN)/python -m pytest -q -m cluster
+
+soak: install
+	OMP_NUM_THREADS=1 $(BIN)/python tests/faults/soak.py
 
 lint: install
 	$(BIN)/ruff check .

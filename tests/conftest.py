@@ -10,9 +10,8 @@ import pytest
 import torch
 from hypothesis import settings
 
-# Set before anything imports Ray. Loopback only, no usage reports, no token file in the home folder.
+# Set before anything imports Ray: loopback only, no usage reports.
 os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
-os.environ.setdefault("RAY_AUTH_MODE", "disabled")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -32,7 +32,7 @@ from pipeline.checkpoint import META, committed
 from pipeline.config import Job
 from pipeline.errors import CrossrayError
 from pipeline.launch.home import follow
-from pipeline.launch.room import Node, Wanted, check_room, places, wanted
+from pipeline.launch.room import Wanted, alive_nodes, check_room, places, wanted
 from pipeline.launch.stop import StopFile, StopRequest, stopped_by_signals
 from pipeline.launch.tasks import ray_session
 from pipeline.photos import open_photos
@@ -149,13 +149,6 @@ def check_cluster(job: Job) -> Wanted:
     need = wanted(job, nodes)
     check_room(need, nodes)
     return need
-
-
-def alive_nodes() -> list[Node]:
-    """What each node of the cluster has in all."""
-    import ray
-
-    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
 def with_device(job: Job, need: Wanted) -> Job:

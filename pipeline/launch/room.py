@@ -33,6 +33,13 @@ class Wanted:
         return f"1 rank of {share}" if self.ranks == 1 else f"{self.ranks} ranks of {share} each"
 
 
+def alive_nodes() -> list[Node]:
+    """What each node of the cluster has in all."""
+    import ray
+
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
+
+
 def wanted(job: Job, nodes: Sequence[Node]) -> Wanted:
     """What the job takes: GPUs where it says so, and with `device: auto` where the cluster has any."""
     gpus = job.device == "cuda" or (job.device == "auto" and any(node.get("GPU", 0) for node in nodes))

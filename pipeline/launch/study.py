@@ -11,22 +11,24 @@ import json
 import logging
 import os
 import platform
-import signal
 import subprocess
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.checkpoint import committed
-from pipeline.config import save_job
+from pipeline.config import Job, save_job
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.launch.process import Outcome, Spec, run_one
+from pipeline.launch.room import alive_nodes, check_room, wanted
 from pipeline.launch.run import claim_run, ensure_shards
-from pipeline.launch.tasks import Mapper, ray_tasks
-from pipeline.launch.torchrun import StopFlag, pick_device
+from pipeline.launch.stop import stopped_by_signals
+from pipeline.launch.tasks import Mapper, ray_session, ray_tasks
+from pipeline.launch.torchrun import pick_device
 from pipeline.protocol import check_protocols
 from pipeline.study import Run, StudyJob, Table, expand, make_tables, result_of, write_results
 from pipeline.train import checkpoints
@@ -48,6 +50,14 @@ def run_study(
     """
     if "RANK" in os.environ:
         raise CrossrayError("a study starts its runs itself; start it without torchrun")
+    with ray_session() if on_cluster() else nullcontext():
+        return run_what_is_left(study, tasks)
+
+
+def run_what_is_left(
+    study: StudyJob, tasks: Callable[..., AbstractContextManager[Mapper]]
+) -> tuple[list[Table], dict[str, str]]:
+    """Like run_study; where there is a cluster, connected to it."""
     runs = expand(study)
     for run in {(r.job.shards, r.job.scene, r.job.model.transient): r for r in reversed(runs)}.values():
         with named(run):
@@ -62,7 +72,7 @@ def run_study(
     for run in todo:
         with named(run):
             check_protocols(run.job)
-            pick_device(run.job, run.job.ranks - 1)
+            takes_gpus(run.job)
     failures: dict[str, str] = {}
     try:
         failures = run_all(study, todo, tasks) if todo else {}
@@ -115,7 +125,7 @@ def run_all(study: StudyJob, todo: list[Run], tasks: Callable[..., AbstractConte
 def spec_of(run: Run, stop: Path) -> Spec:
     """The task of a run."""
     job, folder = run.job, Path.cwd()
-    on_gpus = pick_device(job, job.ranks - 1).type == "cuda"
+    on_gpus = takes_gpus(job)
     return Spec(
         name=job.name,
         run=folder / job.run,
@@ -128,37 +138,29 @@ def spec_of(run: Run, stop: Path) -> Spec:
     )
 
 
+def on_cluster() -> bool:
+    """Whether the runs go to a cluster, and not to this machine."""
+    return bool(os.environ.get("RAY_ADDRESS"))
+
+
+def takes_gpus(job: Job) -> bool:
+    """Whether a run takes a GPU a rank.
+
+    Raises:
+        CrossrayError: no node of the cluster, or not this machine, has room for all of its ranks.
+    """
+    if not on_cluster():
+        return pick_device(job, job.ranks - 1).type == "cuda"
+    nodes = alive_nodes()
+    need = replace(wanted(job, nodes), placement="STRICT_PACK")  # a run of a study is one process and its children
+    if need.gpus:
+        check_room(need, nodes)
+    return need.gpus > 0
+
+
 def needs_of(spec: Spec) -> dict[str, int]:
     """What Ray is asked for."""
     return {"num_cpus": spec.cpus, "num_gpus": spec.gpus}
-
-
-class StopFile(StopFlag):
-    """Set by SIGTERM or Ctrl-C, and seen by the tasks as a file. A later Ctrl-C ends at once."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.path = path
-
-    def stop(self, number: int, frame: object) -> None:
-        """The handler."""
-        super().stop(number, frame)
-        if not self.path.exists():
-            self.path.touch()
-            log.info("stopping: the runs save where they are (Ctrl-C again: nobody waits for them)")
-
-
-@contextmanager
-def stopped_by_signals(path: Path) -> Iterator[None]:
-    """SIGTERM and Ctrl-C make the file `path`; whatever ends the block, nothing of it is left."""
-    previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    StopFile(path).install()
-    try:
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def source_of_code() -> str:

@@ -13,7 +13,6 @@ import torch.distributed as dist
 from pipeline.config import Job, load_job
 from pipeline.errors import CrossrayError
 from pipeline.launch.stop import RankStop
-from pipeline.launch.stop import StopFlag as StopFlag  # local.py and study.py take it from here for now
 from pipeline.log import set_up_logging
 from pipeline.train import Context, train
 

@@ -31,7 +31,8 @@ from pipeline.evaluate import evaluate_run
 from pipeline.launch import process
 from pipeline.launch.process import Outcome, Spec, alone, ending, environment, last_line, run_one
 from pipeline.launch.run import claim_run
-from pipeline.launch.study import needs_of, run_study, spec_of, stopped_by_signals
+from pipeline.launch.stop import stopped_by_signals
+from pipeline.launch.study import needs_of, run_study, spec_of
 from pipeline.launch.tasks import TaskError, in_process, ray_tasks
 from pipeline.published import published_tables
 from pipeline.study import (
