@@ -18,6 +18,7 @@ from pipeline.heartbeat import rank_path, read_beat
 from pipeline.train import checkpoints
 
 pytestmark = pytest.mark.slow
+LONG = pytest.mark.cluster  # what `make test` shows in another way already
 
 DRAWS = random.Random(20261122)  # which rank, which step
 
@@ -54,7 +55,7 @@ def steps_of(job) -> list[str]:
 # Exactness
 
 
-@pytest.mark.parametrize("ranks", [1, 2, 4])
+@pytest.mark.parametrize("ranks", [pytest.param(1, marks=LONG), pytest.param(2, marks=LONG), 4])
 def test_stopped_and_resumed_by_another_launcher_is_the_same_to_the_bit(cut, straight, tmp_path, ranks):
     job = small_job(cut, f"stopped-{ranks}", ranks)
     go, step = tmp_path / "go", DRAWS.randrange(EVERY + 1, STEPS - 1)
@@ -83,6 +84,7 @@ def test_a_rank_killed_by_force_is_started_again_by_torchrun(cut, straight, tmp_
     assert_same_run(job, straight(2))
 
 
+@LONG
 def test_a_rank_killed_by_force_ends_the_local_launcher_which_goes_on_when_run_again(cut, straight, tmp_path):
     job, faults = small_job(cut, "killed-local"), [["kill", 1, EVERY + 3, str(tmp_path / "killed")]]
     status, text = Running(job, tmp_path, faults=faults).end()
@@ -93,6 +95,7 @@ def test_a_rank_killed_by_force_ends_the_local_launcher_which_goes_on_when_run_a
     assert_same_run(job, straight(2))
 
 
+@LONG
 @pytest.mark.parametrize("launcher", ["local", "torchrun"])
 def test_ranks_whose_launcher_was_killed_save_and_end(cut, straight, tmp_path, launcher):
     job, go = small_job(cut, f"orphans-{launcher}"), tmp_path / "go"
@@ -124,7 +127,7 @@ def test_killed_between_a_checkpoints_files_and_its_commit(cut, straight, tmp_pa
 # Damaged
 
 
-@pytest.mark.parametrize("damage", ["truncated", "flipped"])
+@pytest.mark.parametrize("damage", [pytest.param("truncated", marks=LONG), "flipped"])
 def test_a_damaged_newest_checkpoint_is_passed_over(cut, straight, tmp_path, damage):
     job, marker = small_job(cut, damage, 1), tmp_path / "killed"
     Running(job, tmp_path, faults=[["kill", 0, 2 * EVERY + 5, str(marker)]]).end()
@@ -195,6 +198,7 @@ def test_a_full_disk_costs_no_step(cut, straight, small_disk, tmp_path):
     assert_same_run(job, straight(1))
 
 
+@LONG
 def test_a_disk_full_at_the_end_is_an_error_and_loses_nothing(cut, straight, small_disk, tmp_path):
     job, go = small_job(cut, "full-at-the-end", 1), tmp_path / "go"
     job = job.model_copy(update={"runs": small_disk})
@@ -228,7 +232,10 @@ def fill(path: Path) -> None:
 # Numbers that are not finite
 
 
-@pytest.mark.parametrize("fault", [["nan", 1, 23], ["infinite-gradient", 23]], ids=lambda fault: fault[0])
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(["nan", 1, 23], id="nan"), pytest.param(["infinite-gradient", 23], id="gradient", marks=LONG)],
+)
 def test_a_bad_step_is_named_and_can_be_left_out(cut, tmp_path, fault):
     skipping = small_job(cut, f"without-{fault[0]}", skip_steps=[23])
     finish(skipping, tmp_path)
@@ -247,6 +254,7 @@ def test_a_bad_step_is_named_and_can_be_left_out(cut, tmp_path, fault):
     assert_same_run(job, skipping)
 
 
+@LONG
 def test_a_step_that_is_trained_on_cannot_be_left_out_later(cut, tmp_path, straight):
     job = small_job(cut, "late", 1)
     Running(job, tmp_path, faults=[["kill", 0, 2 * EVERY + 1, str(tmp_path / "killed")]]).end()

@@ -124,7 +124,7 @@ def assert_same_run(job: Job, other: Job) -> None:
         assert losses.rows.tobytes() == theirs[rank].rows.tobytes(), f"losses of rank {rank} differ"
 
 
-@pytest.mark.slow
+@pytest.mark.cluster
 def test_a_killed_rank_is_started_again_and_nothing_is_lost(cut, straight, tmp_path):
     job, draw = two_ranks(cut, "killed-rank"), random.Random(4)
     rank, step = draw.randrange(2), draw.randrange(EVERY, STEPS // 2)

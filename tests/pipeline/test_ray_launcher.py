@@ -186,7 +186,7 @@ def test_ray_gives_the_bits_of_the_local_launcher(cut, monkeypatch):
         assert losses.rows.tobytes() == theirs[rank].rows.tobytes()
 
 
-@pytest.mark.slow
+@pytest.mark.cluster
 def test_an_error_that_the_user_has_to_put_right_is_one_message_and_no_second_try(cut, tmp_path):
     rates = dict.fromkeys(("grid", "field", "appearance", "transient"), 1e30)
     job = two_ranks(cut, "failing", launcher="ray", train={"learning_rates": rates})
