@@ -13,7 +13,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install quickstart test test-cluster soak check lint format clean
+.PHONY: install quickstart test test-cluster soak check check-model check-pipeline lint format clean
 
 install: $(STAMP)
 
@@ -27,8 +27,11 @@ $(STAMP): pyproject.toml constraints.txt
 quickstart: install
 	$(BIN)/crossray quickstart
 
-check: lint
-	$(BIN)/python -m pytest -q -m "not slow and not real and not cluster"
+check: install
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync lint check-model check-pipeline
+
+check-model check-pipeline: check-%: install
+	$(BIN)/python -m pytest -q -m "not slow and not real and not cluster" tests/$*
 
 test: install
 	$(BIN)/python -m pytest -q -m "not cluster"

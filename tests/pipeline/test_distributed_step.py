@@ -11,6 +11,8 @@ from model.methods import METHODS
 from pipeline.batches import TrainingPhotos
 from pipeline.train import Context, Work, build_model, distribute, forward
 
+pytestmark = pytest.mark.slow
+
 CONTEXT = Context(rank=0, world_size=2)  # so that the model is wrapped
 
 

@@ -32,6 +32,8 @@ from pipeline.render import colour_view, read_appearance, render_view
 from pipeline.runs import load_run
 from pipeline.train import Context, build_model, build_optimiser, train
 
+pytestmark = pytest.mark.slow
+
 MLP = {"width": 256, "xyz_frequencies": 15, "dir_frequencies": 4, "coarse_samples": 6, "fine_samples": 6}
 
 

@@ -54,6 +54,8 @@ from pipeline.study import (
 )
 from pipeline.train import Context, train
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 JOBS = ROOT / "jobs"
 STUDIES = ("ablation", "num_rays", "transient")
