@@ -41,8 +41,8 @@ from pipeline.config import (
 from pipeline.evaluate import recorded
 from pipeline.files import atomic_write
 from pipeline.published import Scores, published_tables
+from pipeline.resume import checkpoints
 from pipeline.shards import MANIFEST, read_manifest
-from pipeline.train import checkpoints
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=40)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]

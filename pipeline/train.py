@@ -31,11 +31,9 @@ from pipeline.patches import steps_per_epoch
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
 from pipeline.record import GRADIENT, LossRecord, record_path
-from pipeline.resume import TrainingError, checkpoints, own_run, resume, run_identity
+from pipeline.resume import own_run, resume, run_identity
 from pipeline.together import agree, broken_step, check_finite, control_group, save
 from pipeline.work import Context, Work
-
-__all__ = ["Context", "TrainingError", "Work", "checkpoints", "train"]
 
 LOOK_EVERY = 10  # steps between the moments at which losses are read from the device
 REPORT_EVERY = 60.0  # seconds between two reports to the launcher, at least

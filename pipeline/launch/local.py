@@ -14,7 +14,8 @@ from pipeline.errors import CrossrayError
 from pipeline.launch.stop import StopFlag
 from pipeline.launch.torchrun import pick_device, run_rank_of
 from pipeline.photos import open_photos
-from pipeline.train import Context, train
+from pipeline.train import train
+from pipeline.work import Context
 
 
 def run_local(job: Job) -> dict[str, Any]:

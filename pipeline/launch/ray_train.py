@@ -36,7 +36,9 @@ from pipeline.launch.room import Wanted, alive_nodes, check_room, places, wanted
 from pipeline.launch.stop import StopFile, StopRequest, stopped_by_signals
 from pipeline.launch.tasks import ray_session
 from pipeline.photos import open_photos
-from pipeline.train import Context, checkpoints, train
+from pipeline.resume import checkpoints
+from pipeline.train import train
+from pipeline.work import Context
 
 log = logging.getLogger("crossray")
 

@@ -30,8 +30,8 @@ from pipeline.launch.stop import stopped_by_signals
 from pipeline.launch.tasks import Mapper, ray_session, ray_tasks
 from pipeline.launch.torchrun import pick_device
 from pipeline.protocol import check_protocols
+from pipeline.resume import checkpoints
 from pipeline.study import Run, StudyJob, Table, expand, make_tables, result_of, write_results
-from pipeline.train import checkpoints
 
 log = logging.getLogger("crossray")
 

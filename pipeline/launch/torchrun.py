@@ -14,7 +14,8 @@ from pipeline.config import Job, load_job
 from pipeline.errors import CrossrayError
 from pipeline.launch.stop import RankStop
 from pipeline.log import set_up_logging
-from pipeline.train import Context, train
+from pipeline.train import train
+from pipeline.work import Context
 
 
 def pick_device(job: Job, local_rank: int) -> torch.device:

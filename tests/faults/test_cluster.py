@@ -28,7 +28,7 @@ from tiny_scene import write_tiny_scene
 from pipeline.checkpoint import committed, read_checkpoint
 from pipeline.config import Job, load_job
 from pipeline.heartbeat import rank_path, read_beat
-from pipeline.train import checkpoints
+from pipeline.resume import checkpoints
 
 pytestmark = pytest.mark.cluster
 

@@ -15,7 +15,7 @@ from tiny_run import cut_tiny
 
 from pipeline.checkpoint import committed
 from pipeline.heartbeat import rank_path, read_beat
-from pipeline.train import checkpoints
+from pipeline.resume import checkpoints
 
 pytestmark = pytest.mark.slow
 LONG = pytest.mark.cluster  # what `make test` shows in another way already

@@ -23,7 +23,7 @@ from pipeline.heartbeat import rank_path, read_beat
 from pipeline.launch.local import run_local
 from pipeline.launch.run import claim_run
 from pipeline.record import read_losses
-from pipeline.train import checkpoints
+from pipeline.resume import checkpoints
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = 200

@@ -18,7 +18,8 @@ from pipeline.compare import compare_runs
 from pipeline.config import save_job
 from pipeline.errors import CrossrayError
 from pipeline.record import record_path
-from pipeline.train import Context, train
+from pipeline.train import train
+from pipeline.work import Context
 
 STEPS = 12
 

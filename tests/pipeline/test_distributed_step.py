@@ -9,7 +9,8 @@ from tiny_run import cut_tiny, tiny_job, tiny_photos
 
 from model.methods import METHODS
 from pipeline.batches import TrainingPhotos
-from pipeline.train import Context, Work, build_model, distribute, forward
+from pipeline.train import build_model, distribute, forward
+from pipeline.work import Context, Work
 
 pytestmark = pytest.mark.slow
 

@@ -34,7 +34,8 @@ from pipeline.photos import open_photos
 from pipeline.protocol import parse_protocol
 from pipeline.render import render_picture
 from pipeline.runs import checkpoint_of, job_of, load_run
-from pipeline.train import Context, train
+from pipeline.train import train
+from pipeline.work import Context
 
 STEP = "step-00000006"
 

@@ -30,7 +30,8 @@ from pipeline.importing import import_checkpoint, networks
 from pipeline.photos import open_photos
 from pipeline.render import colour_view, read_appearance, render_view
 from pipeline.runs import load_run
-from pipeline.train import Context, build_model, build_optimiser, train
+from pipeline.train import build_model, build_optimiser, train
+from pipeline.work import Context
 
 pytestmark = pytest.mark.slow
 

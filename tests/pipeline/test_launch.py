@@ -22,7 +22,7 @@ from pipeline.config import Job, save_job
 from pipeline.errors import CrossrayError
 from pipeline.launch.local import run_local
 from pipeline.launch.run import claim_run
-from pipeline.train import checkpoints
+from pipeline.resume import checkpoints
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = 100

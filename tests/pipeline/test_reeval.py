@@ -33,7 +33,8 @@ from pipeline.launch.run import claim_run
 from pipeline.launch.tasks import in_process, ray_session
 from pipeline.reeval import ReevalJob, find_runs, interval, load_reeval, one_pass
 from pipeline.runs import checkpoint_of
-from pipeline.train import Context, train
+from pipeline.train import train
+from pipeline.work import Context
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 100.0  # seconds until a test gives a process up

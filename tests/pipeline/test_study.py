@@ -52,7 +52,8 @@ from pipeline.study import (
     spread,
     tied_with_best,
 )
-from pipeline.train import Context, train
+from pipeline.train import train
+from pipeline.work import Context
 
 pytestmark = pytest.mark.slow
 

@@ -31,8 +31,10 @@ from pipeline.launch.tasks import in_process
 from pipeline.launch.torchrun import pick_device, run_rank
 from pipeline.masks import MaskRecord, encode_mask
 from pipeline.photos import open_photos
+from pipeline.resume import TrainingError, checkpoints
 from pipeline.shards import cut_shards, verify_shards
-from pipeline.train import Context, TrainingError, checkpoints, train
+from pipeline.train import train
+from pipeline.work import Context
 
 
 @pytest.fixture(scope="module")

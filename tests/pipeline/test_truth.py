@@ -30,8 +30,9 @@ from pipeline.protocol import check_protocols, parse_protocol
 from pipeline.render import predicted_mask, read_appearance, render_picture
 from pipeline.runs import load_run
 from pipeline.shards import cut_shards
-from pipeline.train import Context, train
+from pipeline.train import train
 from pipeline.truth import check_truth, elsewhere, mask_iou, reduced, truth_of
+from pipeline.work import Context
 
 pytestmark = pytest.mark.slow  # half a minute together: not for every commit
 

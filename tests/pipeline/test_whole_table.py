@@ -33,8 +33,10 @@ from pipeline.fit import FitRecipe
 from pipeline.launch.run import claim_run
 from pipeline.protocol import parse_protocol
 from pipeline.render import predicted_mask, render_picture, training_appearance
+from pipeline.resume import checkpoints
 from pipeline.runs import load_run
-from pipeline.train import Context, checkpoints, train
+from pipeline.train import train
+from pipeline.work import Context
 
 pytestmark = pytest.mark.slow
 

@@ -15,8 +15,10 @@ from pipeline.checkpoint import latest_checkpoint
 from pipeline.config import Job, make_job, merge
 from pipeline.launch.tasks import in_process
 from pipeline.photos import Photos, open_photos
+from pipeline.resume import checkpoints
 from pipeline.shards import cut_shards
-from pipeline.train import Context, checkpoints, train
+from pipeline.train import train
+from pipeline.work import Context
 
 SPLITS = ("train", "train", "train", "test", "val", "train")
 
