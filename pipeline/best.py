@@ -13,10 +13,19 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
+
 from pipeline.checkpoint import folder_name
 from pipeline.files import atomic_write
 
 BEST = "best.json"
+
+
+def lock_of_best(run: Path) -> FileLock:
+    """Held by whoever points to the best checkpoints of a run, or removes others."""
+    folder = run / ".evaluating"
+    folder.mkdir(parents=True, exist_ok=True)
+    return FileLock(folder / "best.lock")
 
 
 def write_best(folder: Path, results: Iterable[dict[str, Any]]) -> None:

@@ -87,20 +87,22 @@ def write_pictures(writer: SummaryWriter, step: int, model: SceneModel, photos: 
     camera = photos.records[index]
     stride = max(1, round(max(camera.width, camera.height) / PICTURE_SIDE))
     model.eval()
-    appearance = training_appearance(model, photos, index)
-    view = render_view(model, camera, appearance if model.coded else None, stride=stride)
-    picture = colour_view(model, view, appearance)
-    photo = photos.image(index)[stride // 2 :: stride, stride // 2 :: stride] / 255
-    writer.add_image("view/rendered", picture, step, dataformats="HWC")
-    writer.add_image("view/photo", photo, step, dataformats="HWC")
-    depth = (view.depth / view.depth.max().clamp(min=1e-6)).cpu().numpy()
-    writer.add_image("view/depth", depth, step, dataformats="HW")
-    writer.add_scalar("view/psnr", psnr_of(float(np.square(picture - photo).mean())), step)
-    masked = index if model.segmenter is not None else photos.indices("train")[0]
-    mask = predicted_mask(model, photos, masked, stride)
-    if mask is not None:
-        writer.add_image("view/mask", mask, step, dataformats="HW")
-    model.train()
+    try:
+        appearance = training_appearance(model, photos, index)
+        view = render_view(model, camera, appearance if model.coded else None, stride=stride)
+        picture = colour_view(model, view, appearance)
+        photo = photos.image(index)[stride // 2 :: stride, stride // 2 :: stride] / 255
+        writer.add_image("view/rendered", picture, step, dataformats="HWC")
+        writer.add_image("view/photo", photo, step, dataformats="HWC")
+        depth = (view.depth / view.depth.max().clamp(min=1e-6)).cpu().numpy()
+        writer.add_image("view/depth", depth, step, dataformats="HW")
+        writer.add_scalar("view/psnr", psnr_of(float(np.square(picture - photo).mean())), step)
+        masked = index if model.segmenter is not None else photos.indices("train")[0]
+        mask = predicted_mask(model, photos, masked, stride)
+        if mask is not None:
+            writer.add_image("view/mask", mask, step, dataformats="HW")
+    finally:
+        model.train()
 
 
 def write_evaluation(folder: Path, step: int, protocol: str, mean: dict[str, float], picture: np.ndarray) -> None:

@@ -138,10 +138,14 @@ def latest_checkpoint(folder: Path) -> Checkpoint | None:
     return None
 
 
-def prune(folder: Path, keep: int, named: Collection[int] = ()) -> None:
+def prune(folder: Path, keep: int, named: Collection[int] = (), newest: int | None = None) -> None:
     """Remove all but the newest `keep` committed checkpoints and those of the steps in `named`, and the remains of
-    older uncommitted ones."""
-    whole = committed(folder)
+    older uncommitted ones.
+
+    Args:
+        newest: the step that was saved last; what seems newer is damaged, or training would not be here.
+    """
+    whole = [path for path in committed(folder) if newest is None or path.name <= folder_name(newest)]
     if not whole:
         return
     stale = [p for p in folder.glob("step-????????") if p not in whole and p < whole[-1]]

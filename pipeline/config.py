@@ -111,7 +111,8 @@ class TrainJob(Section):
     any_ranks: bool = False
     """Allow to go on from a checkpoint of another number of ranks: each step then sees another number of rays."""
     deterministic: bool = False
-    """On GPUs: only algorithms that give the same bits each time. Slower; not yet measured. On CPU it is always so."""
+    """On GPUs: algorithms that give the same bits each time, and a warning where torch has none. Not yet measured. On
+    CPU it is always so."""
 
 
 class EvaluateJob(Section):

@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 from PIL import Image
 
 from model.scene_model import SceneModel
-from pipeline.best import write_best
+from pipeline.best import lock_of_best, write_best
 from pipeline.board import write_evaluation
 from pipeline.checkpoint import (
     META,
@@ -347,7 +347,7 @@ def alone(checkpoint: Checkpoint) -> Iterator[None]:
 
 def update_best(run: Path, protocol_name: str) -> None:
     """Point `best.json` of a protocol to the best checkpoint that is there."""
-    with lock_of(run, "best"):
+    with lock_of_best(run):
         results = []
         for target in committed(run / "checkpoints"):
             try:

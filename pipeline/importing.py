@@ -32,8 +32,9 @@ from pipeline.config import Job, save_job
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write, sync_folder
 from pipeline.photos import Photos, open_photos
+from pipeline.resume import run_identity
 from pipeline.torch_file import StoredTensor, TorchFile, printable, read_bytes
-from pipeline.train import build_model, build_optimiser, run_identity
+from pipeline.train import build_model, build_optimiser, epoch_length
 
 log = logging.getLogger("crossray")
 
@@ -89,7 +90,7 @@ def import_checkpoint(file: Path, job: Job) -> Path:
         "networks_not_in_the_file": [prefix.rstrip(".") for prefix in fresh],
         "objects_not_made": saved.named,
     }
-    meta = run_identity(job, photos) | {
+    meta = run_identity(job, photos, epoch_length(job, photos.sizes("train"), job.ranks)) | {
         "seconds": 0.0,
         "finished": True,
         "world_size": job.ranks,

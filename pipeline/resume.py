@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from filelock import FileLock, Timeout
@@ -17,12 +19,13 @@ from pipeline.checkpoint import Checkpoint, latest_checkpoint
 from pipeline.clock import Clock
 from pipeline.config import BOOKKEEPING, Job
 from pipeline.errors import CrossrayError
-from pipeline.heartbeat import rank_path, read_beat
+from pipeline.heartbeat import alive, rank_path, read_beat
 from pipeline.photos import Photos
 
 log = logging.getLogger("crossray")
 
-PATIENCE = 20.0  # seconds in which a rank that was killed, or a node that was lost, has let go of the run
+PATIENCE = 20.0  # seconds in which a rank that was killed has let go of the run
+LEASE = 150.0  # seconds until a network's disk lets go of what a node held that was lost
 
 
 class TrainingError(CrossrayError):
@@ -42,34 +45,42 @@ def own_run(job: Job) -> Iterator[None]:
         TrainingError: another process holds it.
     """
     job.run.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(job.run / ".training.lock")
-    try:
-        lock.acquire(timeout=PATIENCE)
-    except Timeout:
-        beat = read_beat(rank_path(job.run, 0)) or {}
+    lock, began = FileLock(job.run / ".training.lock"), time.monotonic()
+    while not lock.is_locked:
+        try:
+            lock.acquire(timeout=PATIENCE)
+            break
+        except Timeout:
+            beat = read_beat(rank_path(job.run, 0)) or {}
+        if beat and not alive(beat) and time.monotonic() - began < LEASE:
+            continue
         where = f"process {beat['pid']} on {beat['host']}" if beat else "another process"
         raise TrainingError(
             f"{job.run}: {where} trains this run already; wait for it (`crossray status {job.run}`), stop it, or "
             "choose another name (--set name=...)"
-        ) from None
+        )
     try:
         yield
     finally:
         lock.release()
 
 
-def run_identity(job: Job, photos: Photos) -> dict[str, str]:
-    """What must agree for a checkpoint to be this run's: the photos, and all of the job that enters the result."""
-    relevant = job.model_dump(
-        mode="json", include={"method", "model", "patch", "losses", "train"}, exclude={"train": set(BOOKKEEPING)}
-    )
+def run_identity(job: Job, photos: Photos, steps_per_epoch: int) -> dict[str, Any]:
+    """What must agree for a checkpoint to be this run's: the photos, and all of the job that enters the result; of the
+    epoch's length the number, whether the job gives it or not."""
+    left_out = {"train": {*BOOKKEEPING, "steps_per_epoch"}}
+    relevant = job.model_dump(mode="json", include={"method", "model", "patch", "losses", "train"}, exclude=left_out)
     text = json.dumps(relevant, sort_keys=True)
-    return {"shards": photos.manifest.content_hash, "job": hashlib.sha256(text.encode()).hexdigest()}
+    return {
+        "shards": photos.manifest.content_hash,
+        "job": hashlib.sha256(text.encode()).hexdigest(),
+        "steps_per_epoch": steps_per_epoch,
+    }
 
 
 def resume(
     job: Job,
-    identity: dict[str, str],
+    identity: dict[str, Any],
     model: SceneModel,
     optimiser: torch.optim.Optimizer,
     clock: Clock,
@@ -84,13 +95,19 @@ def resume(
     checkpoint = latest_checkpoint(checkpoints(job))
     if checkpoint is None:
         return ()
-    differs = [key for key, value in identity.items() if checkpoint.meta.get(key) != value]
+    differs = [key for key in ("shards", "job") if checkpoint.meta.get(key) != identity[key]]
     if differs:
         raise TrainingError(
             f"{checkpoint.folder} was written with other {' and '.join(differs)}: it cannot be gone on from. "
             f"Choose another name (--set name=...), or remove {job.run}"
         )
     check_ranks(job, checkpoint, world_size)
+    length = checkpoint.meta["steps_per_epoch"]
+    if length != identity["steps_per_epoch"]:
+        raise TrainingError(
+            f"train.steps_per_epoch: {checkpoint.folder} is of epochs of {length} steps, and now they would have "
+            f"{identity['steps_per_epoch']}; --set train.steps_per_epoch={length} goes on with it"
+        )
     skipped = tuple(checkpoint.meta["skipped"])
     late = [step for step in job.train.skip_steps if step < checkpoint.step and step not in skipped]
     if late:
@@ -114,11 +131,6 @@ def check_ranks(job: Job, checkpoint: Checkpoint, world_size: int) -> None:
         raise TrainingError(
             f"{checkpoint.folder} was written by {before} ranks, and now there are {world_size}: --set ranks={before} "
             "goes on exactly; --set train.any_ranks=true goes on with other numbers of rays a step"
-        )
-    if job.train.steps_per_epoch == "auto":
-        raise TrainingError(
-            "train.steps_per_epoch: auto depends on the number of ranks; to go on with another one, set it to the "
-            f"number in {job.run / 'training.json'}"
         )
     log.warning(
         "%s goes on from %d ranks with %d: from step %d on a step averages over %d patches instead of %d, and the "

@@ -6,13 +6,15 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import torch
 import torch.distributed as dist
+from filelock import Timeout
 
 from model.scene_model import SceneModel
-from pipeline.best import best_steps
+from pipeline.best import best_steps, lock_of_best
 from pipeline.checkpoint import committed, prune, save_checkpoint
 from pipeline.clock import Speed
 from pipeline.record import GRADIENT, LossRecord
@@ -36,6 +38,17 @@ def agree(together: dist.ProcessGroup | None, context: Context, seconds: float) 
     return bool(shared[0] > 0), float(shared[1])
 
 
+def same_step(together: dist.ProcessGroup | None, context: Context, step: int) -> None:
+    """RuntimeError where ranks go on from other steps, as when a disk shows one of them less than the others; an error
+    of this kind is one after which a launcher may try again."""
+    if context.world_size == 1:
+        return
+    ends = torch.tensor([step, -step])
+    dist.all_reduce(ends, dist.ReduceOp.MIN, group=together)
+    if ends[0] != -ends[1]:
+        raise RuntimeError(f"ranks go on from steps {int(ends[0])} to {-int(ends[1])}: they see other checkpoints")
+
+
 def save(
     work: Work,
     together: dist.ProcessGroup | None,
@@ -54,7 +67,10 @@ def save(
     began, job, step = time.perf_counter(), work.job, speed.clock.step
     folder, problem = checkpoints(job), attempt(record.save)
     if work.context.world_size > 1:
-        dist.barrier(together)
+        failed = torch.tensor([float(problem is not None)])
+        dist.all_reduce(failed, group=together)
+        if failed[0] and problem is None:
+            problem = OSError("the losses of another rank cannot be written")
     if work.context.rank == 0:
         state = model.state_dict(), optimiser.state_dict()
         problem = problem or attempt(lambda: save_checkpoint(folder, step, *state, meta))
@@ -66,7 +82,8 @@ def save(
     if problem:
         log.error("step %d cannot be saved: %s; training goes on and tries again at the next checkpoint", step, problem)
     elif work.context.rank == 0:
-        prune(folder, job.train.keep_checkpoints, best_steps(job.run))
+        with suppress(Timeout), lock_of_best(job.run).acquire(timeout=0):  # if it is taken, the next save prunes
+            prune(folder, job.train.keep_checkpoints, best_steps(job.run), newest=step)
     speed.wait(time.perf_counter() - began)
 
 

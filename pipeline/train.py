@@ -6,6 +6,7 @@ and resumed anywhere. DDP averages gradients over the ranks; rank 0 alone writes
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -32,7 +33,7 @@ from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
 from pipeline.record import GRADIENT, LossRecord, record_path
 from pipeline.resume import own_run, resume, run_identity
-from pipeline.together import agree, broken_step, check_finite, control_group, save
+from pipeline.together import agree, broken_step, check_finite, control_group, same_step, save
 from pipeline.work import Context, Work
 
 LOOK_EVERY = 10  # steps between the moments at which losses are read from the device
@@ -63,12 +64,13 @@ def train_owned(job: Job, context: Context) -> dict[str, Any]:
     optimiser = build_optimiser(model, job.train)
     seconds = job.train.seconds
     clock = Clock(None if seconds else job.train.epochs * work.steps_per_epoch, seconds)
-    identity = run_identity(job, photos)
+    identity = run_identity(job, photos, work.steps_per_epoch)
     ddp = distribute(model, context)
     together = control_group(context)
     if context.world_size > 2:
         warm_up(work, ddp)
     skipped = set(resume(job, identity, model, optimiser, clock, context.world_size))
+    same_step(together, context, clock.step)
 
     lead = context.rank == 0
     record = LossRecord(record_path(job.run, context.rank), clock.step)
@@ -174,7 +176,7 @@ def set_up_torch(job: Job, device: torch.device) -> None:
     torch.backends.cudnn.allow_tf32 = False  # float32 is float32; torch's default would round in convolutions
     if job.train.deterministic and device.type == "cuda":
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-        torch.use_deterministic_algorithms(True)
+        torch.use_deterministic_algorithms(True, warn_only=True)  # where there is no such algorithm, torch says so
         torch.backends.cudnn.benchmark = False
 
 
@@ -212,8 +214,9 @@ def warm_up(work: Work, ddp: torch.nn.Module) -> None:
     bits: a resumed run must start with the order that an undisturbed one has. Buffers are put back as they were.
     """
     before = {name: buffer.clone() for name, buffer in ddp.named_buffers()}
+    step = next(step for step in itertools.count() if step not in work.job.train.skip_steps)
     for _ in range(2):
-        terms, _ = forward(work, ddp, 0)
+        terms, _ = forward(work, ddp, step)
         torch.stack(list(terms.values())).sum().backward()
         ddp.zero_grad(set_to_none=True)
     for name, buffer in ddp.named_buffers():

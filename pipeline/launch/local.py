@@ -12,10 +12,12 @@ from typing import Any
 from pipeline.config import Job, save_job
 from pipeline.errors import CrossrayError
 from pipeline.launch.stop import StopFlag
-from pipeline.launch.torchrun import pick_device, run_rank_of
+from pipeline.launch.torchrun import STOPPED, pick_device, run_rank_of
 from pipeline.photos import open_photos
 from pipeline.train import train
 from pipeline.work import Context
+
+GRACE = 120  # seconds that ranks have for their last checkpoint and picture
 
 
 def run_local(job: Job) -> dict[str, Any]:
@@ -59,17 +61,38 @@ def run_ranks(job: Job) -> dict[str, Any]:
         max_restarts=0,
         monitor_interval=0.1,
         start_method="spawn",
+        shutdown_timeout=GRACE,
     )
+    before = written(job)
     try:
         return elastic_launch(config, run_rank_of)(str(job_file))[0]
     except SignalException:
-        try:
-            return json.loads((job.run / "training.json").read_text())
-        except FileNotFoundError:
-            raise CrossrayError(f"{job.run}: stopped before the first checkpoint") from None
+        return stopped(job, before)
     except ChildFailedError as error:
         rank, failure = error.get_first_failure()
+        if failure.exitcode == STOPPED:  # somebody has asked one of the ranks, and not this process
+            return stopped(job, before)
         raise CrossrayError(f"training stopped: rank {rank} failed: {first_line(failure.message)}") from None
+
+
+def written(job: Job) -> int | None:
+    """When the run's training.json was written, None if it is not there."""
+    path = job.run / "training.json"
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
+def stopped(job: Job, before: int | None) -> dict[str, Any]:
+    """The result of ranks that were stopped.
+
+    Raises:
+        CrossrayError: they have not saved; `before` is when training.json had been written before they started.
+    """
+    if written(job) == before:
+        raise CrossrayError(
+            f"{job.run}: stopped, and nothing was saved since it was started (what is said above tells why); the same "
+            "command goes on from the last checkpoint"
+        )
+    return json.loads((job.run / "training.json").read_text())
 
 
 def first_line(message: Any) -> str:

@@ -27,8 +27,13 @@ from pipeline.shards import Manifest, cut_shards, mask_path, masks_hash, read_ma
 
 log = logging.getLogger("crossray")
 
-# Keys that may change between two starts of one run: they decide where and when, not what comes out.
-FREE_KEYS = ("launcher", "device", "threads", "runs", "evaluate", "ray", *(f"train.{key}" for key in BOOKKEEPING))
+# Keys that may change between two starts of one run: they decide where and when, not what comes out; or the checkpoint
+# tells whether they may (pipeline/resume.py).
+FREE_KEYS = (
+    *("launcher", "device", "threads", "runs", "evaluate", "ray"),
+    *("ranks", "train.steps_per_epoch"),
+    *(f"train.{key}" for key in BOOKKEEPING),
+)
 
 
 def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -117,11 +122,10 @@ def claim_run(job: Job) -> None:
         if path.exists():
             before = flatten(yaml.safe_load(path.read_text()))
             now = flatten(job.model_dump(mode="json"))
-            free = (*FREE_KEYS, "ranks") if job.train.any_ranks else FREE_KEYS
             differs = [
                 f"  {key}: {before.get(key)!r} -> {now.get(key)!r}"
                 for key in sorted(before.keys() | now.keys())
-                if before.get(key) != now.get(key) and not key.startswith(free)
+                if before.get(key) != now.get(key) and not key.startswith(FREE_KEYS)
             ]
             if differs:
                 raise CrossrayError(

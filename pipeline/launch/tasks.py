@@ -192,8 +192,10 @@ def _map_tasks(
     task = ray.remote(max_retries=RETRIES)(_run_in)
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     folder = Path.cwd()
-    pending = {task.options(name=name, **_fitting(needs(spec), nodes)).remote(folder, fn, spec): spec for spec in specs}
+    pending: dict[Any, Any] = {}
     try:
+        for spec in specs:
+            pending[task.options(name=name, **_fitting(needs(spec), nodes)).remote(folder, fn, spec)] = spec
         while pending and not stop():
             done, _ = ray.wait(list(pending), num_returns=1, timeout=1)
             if not done:

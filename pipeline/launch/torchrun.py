@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from pipeline.launch.stop import RankStop
 from pipeline.log import set_up_logging
 from pipeline.train import train
 from pipeline.work import Context
+
+STOPPED = 143  # exit status of a rank that was asked to stop: 128 + SIGTERM, as a shell counts
 
 
 def pick_device(job: Job, local_rank: int) -> torch.device:
@@ -60,10 +63,14 @@ def run_rank(job: Job) -> dict[str, Any]:
     if device.type == "cuda":
         torch.cuda.set_device(device)
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        return train(job, Context(rank, world, device, RankStop().install()))
+        result = train(job, Context(rank, world, device, RankStop().install()))
     finally:
-        dist.destroy_process_group()
+        for number, handler in before.items():
+            signal.signal(number, handler)  # nobody asks a rank that has returned whether it was told to stop
+    dist.destroy_process_group()  # not after an error: it may wait for ranks that wait for this one
+    return result
 
 
 def check_restarts() -> None:
@@ -78,12 +85,16 @@ def check_restarts() -> None:
 
 
 def run_rank_of(job_file: str) -> dict[str, Any]:
-    """Entry point of a rank that this machine's own launcher starts."""
+    """Entry point of a rank that this machine's own launcher starts.
+
+    A rank that was stopped, or has lost its launcher, ends here: a return would wait for an agent that reads no results
+    any more.
+    """
+    launcher = os.getppid()
     set_up_logging()
     result = run_rank(load_job(Path(job_file)))
-    if not result["finished"]:
+    if not result["finished"] or os.getppid() != launcher:
         sys.stdout.flush()
         sys.stderr.flush()
-        # Asked to stop: the agent that started this rank reads no results any more, and a return would wait for it.
-        os._exit(0)
+        os._exit(STOPPED)
     return result

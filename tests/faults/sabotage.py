@@ -8,6 +8,7 @@ CROSSRAY_SABOTAGE is a JSON list of lists:
     ["infinite-gradient", step]         the loss is finite, its gradient is not
     ["wait", rank, step, file]          this rank waits before this step until the file is there
     ["patience", seconds]               how long a second run waits for the first
+    ["blind", rank]                     this rank sees no checkpoint, as where a network's disk lags behind
 
 A rank that a launcher starts as a process imports this file as well, so the ranks are sabotaged, too.
 """
@@ -94,6 +95,11 @@ def patience(seconds: float) -> None:
     resume.PATIENCE = seconds
 
 
+def blind(rank: int) -> None:
+    original = resume.latest_checkpoint
+    resume.latest_checkpoint = lambda folder: None if os.environ.get("RANK") == str(rank) else original(folder)
+
+
 FAULTS = {
     "kill": kill,
     "kill-uncommitted": kill_uncommitted,
@@ -101,6 +107,7 @@ FAULTS = {
     "infinite-gradient": infinite_gradient,
     "wait": wait,
     "patience": patience,
+    "blind": blind,
 }
 
 for name, *arguments in json.loads(os.environ.get("CROSSRAY_SABOTAGE", "[]")):

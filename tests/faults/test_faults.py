@@ -113,6 +113,31 @@ def test_ranks_whose_launcher_was_killed_save_and_end(cut, straight, tmp_path, l
     assert_same_run(job, straight(2))
 
 
+@LONG
+def test_sigterm_to_one_rank_alone_stops_all_of_them_and_the_launcher(cut, straight, tmp_path):
+    job, go = small_job(cut, "one-rank-asked"), tmp_path / "go"
+    running = Running(job, tmp_path, faults=[["wait", 0, EVERY + 2, str(go)]])
+    running.until(lambda: read_beat(rank_path(job.run, 1)))
+    os.kill(read_beat(rank_path(job.run, 1))["pid"], signal.SIGTERM)
+    go.touch()
+    status, text = running.end()
+    assert status == 0, text
+    assert "stopped; run the same command again to go on" in text
+    finish(job, tmp_path)
+    assert_same_run(job, straight(2))
+
+
+@LONG
+def test_ranks_that_see_other_checkpoints_do_not_train_together(cut, straight, tmp_path):
+    job = small_job(cut, "blind")
+    Running(job, tmp_path, faults=[["kill", 1, EVERY + 3, str(tmp_path / "killed")]]).end()
+    status, text = Running(job, tmp_path, faults=[["blind", 1]]).end()
+    assert status == 2, text
+    assert f"ranks go on from steps 0 to {EVERY}: they see other checkpoints" in text
+    finish(job, tmp_path)
+    assert_same_run(job, straight(2))
+
+
 def test_killed_between_a_checkpoints_files_and_its_commit(cut, straight, tmp_path):
     job, marker = small_job(cut, "uncommitted", 1), tmp_path / "killed"
     running = Running(job, tmp_path, faults=[["kill-uncommitted", 2 * EVERY, str(marker)]])

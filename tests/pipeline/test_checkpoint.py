@@ -20,6 +20,7 @@ from pipeline.checkpoint import (
     TRAINING,
     CheckpointError,
     committed,
+    folder_name,
     latest_checkpoint,
     prune,
     read_checkpoint,
@@ -307,3 +308,13 @@ def test_the_warning_names_what_is_used_instead(tmp_path, caplog):
     assert str(path) in caplog.text
     assert "damaged" in caplog.text
     assert "checkpoint before it" in caplog.text
+
+
+def test_damaged_checkpoints_that_training_passed_over_do_not_push_out_good_ones(tmp_path):
+    for step in (1000, 2000, 3000):
+        (tmp_path / folder_name(step)).mkdir()
+        (tmp_path / folder_name(step) / "meta.json").write_text("damaged" if step > 1000 else "{}")
+    (tmp_path / folder_name(1100)).mkdir()
+    (tmp_path / folder_name(1100) / "meta.json").write_text("{}")
+    prune(tmp_path, keep=2, newest=1100)
+    assert {folder_name(1000), folder_name(1100)} <= {path.name for path in committed(tmp_path)}

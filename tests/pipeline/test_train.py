@@ -21,6 +21,7 @@ from tiny_scene import write_tiny_scene
 from pipeline import judge
 from pipeline import train as module
 from pipeline.batches import check_references
+from pipeline.board import write_pictures
 from pipeline.checkpoint import committed, latest_checkpoint, read_checkpoint, save_checkpoint
 from pipeline.config import load_job, make_job, merge
 from pipeline.errors import CrossrayError
@@ -229,10 +230,29 @@ def test_another_number_of_ranks_is_refused(make):
     train_until(job, 10)
     found = latest_checkpoint(checkpoints(job))
     assert found is not None
-    meta = {key: found.meta[key] for key in ("shards", "job", "seconds", "finished", "skipped")} | {"world_size": 2}
+    meta = {key: found.meta[key] for key in ("shards", "job", "seconds", "finished", "skipped", "steps_per_epoch")} | {
+        "world_size": 2
+    }
     save_checkpoint(checkpoints(job), 11, found.model, found.optimiser(), meta)
     with pytest.raises(TrainingError, match=r"by 2 ranks, and now there are 1: --set ranks=2 .*any_ranks=true"):
         train(job, Context())
+
+
+def test_another_number_of_ranks_keeps_the_length_of_an_epoch(make):
+    """`auto` gives two ranks half as many steps: the number goes on, whether the job gives it or not."""
+    job = make("nerf", epochs=4, steps_per_epoch="auto", any_ranks=True)
+    train_until(job, 3)
+    found = latest_checkpoint(checkpoints(job))
+    assert found is not None
+    length = found.meta["steps_per_epoch"]
+    meta = {k: v for k, v in found.meta.items() if k not in ("format", "step", "sha256", "digest")}
+    save_checkpoint(checkpoints(job), 3, found.model, found.optimiser(), meta | {"steps_per_epoch": 2 * length})
+    with pytest.raises(TrainingError, match=rf"of epochs of {2 * length} steps, .* have {length}; --set"):
+        train(job, Context())
+    with_number = make("nerf", epochs=4, steps_per_epoch=2 * length, any_ranks=True)
+    claim_run(job)
+    claim_run(with_number)  # not another job: the checkpoint decides
+    assert train_until(with_number, 1)["steps"] == 4
 
 
 def test_where_a_run_lies_does_not_enter_its_identity(make, tmp_path):
@@ -366,6 +386,21 @@ def test_tensorboard_of_a_resumed_run_has_each_step_once(make):
     train_until(job, 6)
     train(job, Context())
     assert [e.step for e in events(job).Scalars("loss/fine")] == list(range(1, 13))
+
+
+def test_a_picture_that_cannot_be_written_leaves_the_model_in_training(make):
+    """Else BatchNorm would use its running averages from here on."""
+    job = make("crossray")
+    photos = open_photos(job.shards)
+    model = module.build_model(job, photos, torch.device("cpu"))
+
+    class Full:
+        def add_image(self, *args, **kwargs):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        write_pictures(Full(), 3, model, photos)
+    assert model.training
 
 
 def test_without_a_validation_photo_a_training_photo_is_shown(make, tmp_path):
