@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -160,11 +160,16 @@ def _private_environment() -> Iterator[None]:
 
 
 def _read_token_again() -> None:
-    """Ray keeps the token, and whether there is one, from its first look at the environment."""
-    from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
+    """Ray keeps the token, and whether there is one, from its first look at the environment.
 
-    Config.initialize("")  # first: a thread of Ray's that still ends must not look for a token that has gone
-    AuthenticationTokenLoader.instance().reset_cache()
+    It has no public way to look again. Where the names have changed, a second private Ray of one process may find the
+    token of the first, and say so.
+    """
+    with suppress(ImportError, AttributeError):
+        from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
+
+        Config.initialize("")  # first: a thread of Ray's that still ends must not look for a token that has gone
+        AuthenticationTokenLoader.instance().reset_cache()
 
 
 def _init_ray(**options: Any) -> None:
