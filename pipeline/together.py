@@ -82,7 +82,7 @@ def save(
     if problem:
         log.error("step %d cannot be saved: %s; training goes on and tries again at the next checkpoint", step, problem)
     elif work.context.rank == 0:
-        with suppress(Timeout), lock_of_best(job.run).acquire(timeout=0):  # if it is taken, the next save prunes
+        with suppress(Timeout, OSError), lock_of_best(job.run).acquire(timeout=0):  # else the next save prunes
             prune(folder, job.train.keep_checkpoints, best_steps(job.run), newest=step)
     speed.wait(time.perf_counter() - began)
 
