@@ -89,6 +89,11 @@ def submit_job(
                 metadata=metadata,
             )
         except (RuntimeError, OSError) as error:
+            if "No available agent" in str(error):
+                raise SubmitError(
+                    f"{url}: the cluster's head has no agent for jobs. Another Ray on that machine had its port "
+                    "(52365) when it was started: start the head again"
+                ) from None
             raise SubmitError(f"{url}: the cluster did not take the job: {error}") from error
     return Submitted(client, url, job)
 

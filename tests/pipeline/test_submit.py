@@ -189,6 +189,23 @@ def server(status: int, body: str = ""):
             thread.join()
 
 
+def test_a_head_that_has_lost_its_port_is_told_from_other_refusals(tmp_path, monkeypatch):
+    """As Ray's Jobs API puts it where another Ray was started on that machine before."""
+    (tmp_path / "job.yaml").write_text("kind: reeval\nruns: [runs/x]\n")
+
+    class Client:
+        def submit_job(self, **keys):
+            raise RuntimeError(f"Request failed with status code 500: {reason}.")
+
+    monkeypatch.setattr(submit, "connect", lambda url: Client())
+    reason = "No available agent to submit job, please try again later."
+    with pytest.raises(SubmitError, match=r"no agent for jobs.*52365.*start the head again"):
+        submit.submit_job(tmp_path / "job.yaml", address="http://127.0.0.1:1")
+    reason = "something else"
+    with pytest.raises(SubmitError, match="did not take the job: .*something else"):
+        submit.submit_job(tmp_path / "job.yaml", address="http://127.0.0.1:1")
+
+
 class TestConnect:
     def test_a_token_that_is_missing(self):
         with (
