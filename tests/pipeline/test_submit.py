@@ -202,7 +202,7 @@ def test_a_head_that_has_lost_its_port_is_told_from_other_refusals(tmp_path, mon
     with pytest.raises(SubmitError, match=r"no agent for jobs.*52365.*start the head again"):
         submit.submit_job(tmp_path / "job.yaml", address="http://127.0.0.1:1")
     reason = "something else"
-    with pytest.raises(SubmitError, match="did not take the job: .*something else"):
+    with pytest.raises(SubmitError, match=r"did not take the job: .*something else"):
         submit.submit_job(tmp_path / "job.yaml", address="http://127.0.0.1:1")
 
 
