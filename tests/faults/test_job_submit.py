@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from ray_cluster import Cluster
+from ray_cluster import Cluster, wait_until
 from tiny_run import tiny_mapping
 from tiny_scene import write_tiny_scene
 
@@ -19,7 +19,7 @@ BIN = Path(sys.executable).parent
 SHEBANG = "#!/usr/bin/env -S python -m pipeline run\n"
 
 
-def test_a_literal_job_submit_trains_and_evaluates_and_a_second_job_finds_it_done(tmp_path):
+def test_a_literal_job_submit_trains_and_evaluates_and_a_schedule_finds_it_done_and_is_stopped(tmp_path):
     write_tiny_scene(tmp_path / "scene")
     over = {
         "scene": {"path": "scene", "shards": "shards/tiny"},
@@ -52,3 +52,15 @@ def test_a_literal_job_submit_trains_and_evaluates_and_a_second_job_finds_it_don
         assert json.loads((tmp_path / "runs" / "tiny" / "training.json").read_text())["finished"]
         assert "0 evaluated, 1 there already" in run("crossray", "submit", "jobs/reeval.yaml")
         assert {job["metadata"].get("kind", "literal") for job in cluster.jobs()} == {"literal", "reeval"}
+
+        run("crossray", "submit", "jobs/reeval.yaml", "--set", "every=1s", "--no-wait")
+        schedule = max(cluster.jobs(), key=lambda job: job["start_time"])["submission_id"]
+
+        def log() -> str:
+            return cluster.request(f"/api/jobs/{schedule}/logs")[1]["logs"]
+
+        wait_until(lambda: "the next pass comes 1s after" in log(), "a pass", log)
+        run("ray", "job", "stop", schedule)
+        wait_until(lambda: cluster.job(schedule)["status"] == "STOPPED", "the schedule is stopped", log)
+        assert "stopped; nothing is half-written" in log()
+        assert "Traceback" not in log()
