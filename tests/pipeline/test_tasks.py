@@ -8,12 +8,22 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tiny_scene import write_tiny_scene
 
 from pipeline.errors import CrossrayError
-from pipeline.launch.tasks import PRIVATE_RAY, TaskError, _fitting, in_process, ray_session, ray_tasks
+from pipeline.launch.tasks import (
+    PRIVATE_RAY,
+    TaskError,
+    _fitting,
+    _map_tasks,
+    in_process,
+    one_cpu,
+    ray_session,
+    ray_tasks,
+)
 from pipeline.patches import PatchPlan
 from pipeline.shards import ShardError, cut_shards, write_shard
 
@@ -82,6 +92,35 @@ def test_a_cluster_that_does_not_answer_is_named_at_once(monkeypatch):
         message = rf"RAY_ADDRESS: no Ray cluster at {address} .*refused.*RAY_AUTH_TOKEN"
         with pytest.raises(CrossrayError, match=message), ray_session():
             pass
+
+
+def test_tasks_that_were_sent_before_their_specs_break_off_are_cancelled(monkeypatch):
+    """A lock, or a signal, may end the making of specs half-way."""
+    sent, cancelled = [], []
+
+    class Task:
+        def options(self, **words):
+            return self
+
+        def remote(self, folder, fn, spec):
+            sent.append(spec)
+            return spec
+
+    ray = SimpleNamespace(
+        remote=lambda **words: lambda fn: Task(),
+        nodes=lambda: [{"Alive": True, "Resources": {"CPU": 1.0}}],
+        cancel=cancelled.append,
+        wait=lambda references, **words: (references, []),
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
+
+    def specs():
+        yield from (1, 2)
+        raise OSError("the disk is away")
+
+    with pytest.raises(OSError, match="the disk is away"):
+        list(_map_tasks(double, specs(), needs=one_cpu, died=None, stop=lambda: False))
+    assert sent == cancelled == [1, 2]
 
 
 @pytest.mark.slow
