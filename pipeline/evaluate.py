@@ -49,8 +49,8 @@ from pipeline.metrics import to_8bit
 from pipeline.photos import Photos
 from pipeline.progress import Progress
 from pipeline.protocol import appearance_from, check_protocol, parse_protocol, samples_of
+from pipeline.provenance import device_name
 from pipeline.runs import checkpoint_of, job_of, model_of, photos_of
-from pipeline.train import device_name
 from pipeline.truth import truth_of
 
 log = logging.getLogger("crossray")

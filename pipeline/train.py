@@ -11,7 +11,6 @@ import json
 import math
 import os
 from contextlib import nullcontext
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +30,7 @@ from pipeline.heartbeat import Heartbeat, rank_path
 from pipeline.patches import steps_per_epoch
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
+from pipeline.provenance import device_name
 from pipeline.record import GRADIENT, LossRecord, record_path
 from pipeline.resume import own_run, resume, run_identity
 from pipeline.together import agree, broken_step, check_finite, control_group, same_step, save
@@ -259,13 +259,3 @@ def learning_rate(base: float, train_job: TrainJob, step: int, progress: float) 
         return low + (rate - low) * 0.5 * (1 + math.cos(math.pi * epoch / train_job.epochs))
     late = max(0.0, (progress - train_job.decay_from) / (1 - train_job.decay_from))
     return rate * train_job.decay_floor**late
-
-
-def device_name(device: torch.device) -> str:
-    """The device as its maker calls it."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
-        if line.startswith("model name"):
-            return line.split(":", 1)[1].strip()
-    return "cpu"

@@ -6,18 +6,14 @@ tasks watch: Ray's own ways of ending a task leave a run no time to save.
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import logging
 import os
-import platform
-import subprocess
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pipeline.checkpoint import committed
 from pipeline.config import Job, save_job
@@ -30,6 +26,7 @@ from pipeline.launch.stop import stopped_by_signals
 from pipeline.launch.tasks import Mapper, ray_session, ray_tasks
 from pipeline.launch.torchrun import pick_device
 from pipeline.protocol import check_protocols
+from pipeline.provenance import provenance
 from pipeline.resume import checkpoints
 from pipeline.study import Run, StudyJob, Table, expand, make_tables, result_of, write_results
 
@@ -95,7 +92,7 @@ def named(run: Run) -> Iterator[None]:
 def run_all(study: StudyJob, todo: list[Run], tasks: Callable[..., AbstractContextManager[Mapper]]) -> dict[str, str]:
     """Run them; returns why runs are not done."""
     by_name = {run.job.name: run for run in todo}
-    source = source_of_code()
+    source = json.dumps(provenance(), indent=2)
     for run in todo:
         save_job(run.job, run.job.run / "job.yaml")
         if not committed(checkpoints(run.job)):  # a run that goes on was started by what it says already
@@ -161,22 +158,3 @@ def takes_gpus(job: Job) -> bool:
 def needs_of(spec: Spec) -> dict[str, int]:
     """What Ray is asked for."""
     return {"num_cpus": spec.cpus, "num_gpus": spec.gpus}
-
-
-def source_of_code() -> str:
-    """JSON: the commit if this is a git checkout, marked where files have changed since, and versions."""
-    root = Path(__file__).resolve().parents[2]
-
-    def git(*words: str) -> str | None:
-        found = subprocess.run(["git", "-C", root, *words], capture_output=True, text=True, check=False)
-        return found.stdout.strip() if found.returncode == 0 else None
-
-    commit = git("rev-parse", "HEAD") if (root / ".git").exists() else None
-    versions = {name: importlib.metadata.version(name) for name in ("torch", "numpy", "ray")}
-    record: dict[str, Any] = {
-        "commit": commit and commit + ("-changed" if git("status", "--porcelain") else ""),
-        "versions": versions,
-        "python": platform.python_version(),
-        "machine": platform.processor() or platform.machine(),
-    }
-    return json.dumps(record, indent=2)
