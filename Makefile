@@ -3,6 +3,7 @@
 # make test-cluster a Ray cluster of five nodes on this machine, nodes that are lost, and the slow faults: under 30 minutes
 # make check        the fast part, for every commit
 # make test-cluster clusters of several nodes on this machine, and nodes that are lost: under 30 minutes
+# make test-nerfbaselines the method for nerfbaselines, in an environment of its own (it takes numpy below 2): 3 minutes
 # make soak         training that is killed again and again for 20 minutes
 #
 # A laptop without a GPU: `make quickstart TORCH_INDEX=https://download.pytorch.org/whl/cpu` takes torch's small CPU build.
@@ -12,8 +13,9 @@ TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+BASELINES := .venv-nerfbaselines
 
-.PHONY: install quickstart test test-cluster soak check check-model check-pipeline lint format clean
+.PHONY: install quickstart test test-cluster test-nerfbaselines soak check check-model check-pipeline lint format clean
 
 install: $(STAMP)
 
@@ -39,6 +41,17 @@ test: install
 test-cluster: install
 	$(BIN)/python -m pytest -q -m cluster
 
+test-nerfbaselines: $(BASELINES)/.installed
+	OMP_NUM_THREADS=1 $(BASELINES)/bin/python -m pytest -q tests/nerfbaselines
+
+$(BASELINES)/.installed: pyproject.toml constraints.txt
+	test -x $(BASELINES)/bin/pip || $(PYTHON) -m venv $(BASELINES)
+	grep -vE '^(numpy|pandas)==' constraints.txt > $(BASELINES)/constraints.txt
+	$(BASELINES)/bin/python -m pip install --quiet --disable-pip-version-check \
+	    $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) --constraint $(BASELINES)/constraints.txt \
+	    --editable ".[nerfbaselines]" "pytest>=8.3" "hypothesis>=6.120"
+	touch $@
+
 soak: install
 	OMP_NUM_THREADS=1 $(BIN)/python tests/faults/soak.py
 
@@ -52,4 +65,4 @@ format: install
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) $(BASELINES) build *.egg-info

@@ -13,6 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+StatisticsPolicy = Literal["view", "patch", "running"]
+
 CODE = 48  # numbers in a photo's appearance code (NeRF-W's l_a; Ha-NeRF's)
 TRANSIENT_CODE = 16  # numbers in a photo's transient code (NeRF-W's l_tau)
 VIEW_CODE = 128  # numbers in a photo's code for its uv mask (Ha-NeRF)
@@ -97,6 +99,10 @@ class ModelSpec:
     transform: Literal["learned", "style_only", "mean_only", "closed_form"] = "learned"
     """How `crossray` makes one appearance into another: `learned` from two second moments; `style_only` without the one
     over rays, `mean_only` without any, the controls for them; `closed_form` by Proposition 1, with nothing learned."""
+    statistics: StatisticsPolicy = "view"
+    """Whose content statistics `crossray` uses when a view is rendered: `view`, all rays of the view (released code);
+    `patch`, a grid of 32 x 32 of its rays, as in training; `running`, averages kept in training, the same for every
+    view. Training always uses a patch's own."""
     segmenter: Literal["cgnet", "unet"] = "cgnet"
     """Segmenter network: the released code's, or a small U-Net whose masks are as fine as its input."""
     pixel_center: float = 0.0
@@ -253,4 +259,9 @@ def check_fusion(spec: ModelSpec) -> None:
         raise ValueError(
             f"model.transform: {spec.transform} needs model.appearance: crossray; with {spec.appearance} there is "
             "nothing to transform"
+        )
+    if spec.appearance != "crossray" and spec.statistics != ModelSpec.statistics:
+        raise ValueError(
+            f"model.statistics: {spec.statistics} needs model.appearance: crossray; with {spec.appearance} no "
+            f"statistics are taken, and {ModelSpec.statistics} fits"
         )

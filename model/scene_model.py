@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,17 @@ from model.appearance.compact import CompactEncoder, CompactTransform, at_size
 from model.appearance.crossray import AffineDecoder, ContentStatistics, ReleasedTransform, recolour
 from model.appearance.encoder import ReleasedEncoder
 from model.cameras import patch_grid
-from model.fields.base import Codes, Field, Level, March, Placed, Rays, Rendering, at_least_float32
+from model.fields.base import (
+    RENDER_POINTS,
+    Codes,
+    Field,
+    Level,
+    March,
+    Placed,
+    Rays,
+    Rendering,
+    at_least_float32,
+)
 from model.fields.hash import HashField
 from model.fields.nerf import NeRFField
 from model.losses import (
@@ -38,17 +48,15 @@ from model.losses import (
     photometric,
     uncertain_photometric,
 )
-from model.methods import CODE, TRANSIENT_CODE, ModelSpec, check_spec
+from model.methods import CODE, TRANSIENT_CODE, ModelSpec, StatisticsPolicy, check_spec
 from model.transient.cgnet import CGNet, transient_probability
 from model.transient.unet import UNet
 from model.transient.uvmask import UVMask
 
-StatisticsPolicy = Literal["view", "patch", "running"]
 Transform = ReleasedTransform | CompactTransform | ClosedFormTransform
 
 COMPACT_SIZE = (64, 96)  # height and width at which the compact networks and the U-Net see a photo
 RUNNING_MOMENTUM = 0.01
-RENDER_POINTS = 2**18  # points that go through a field at once when no gradient is needed
 
 
 class Batch(NamedTuple):
@@ -97,15 +105,9 @@ class SceneModel(nn.Module):
         self.use_bfloat16 = False  # set by whoever runs the model on hardware where it pays
         self.coded = spec.appearance in ("embedding", "code")
         self.fuses_points = spec.appearance == "crossray" and spec.fused == "point"
-        head = spec.colour == "head"
-        channels = 3 if head else spec.channels
-        uncertain = spec.transient == "uncertainty"
-        self.field: Field = (
-            HashField(spec.hash, channels, head, box, coded=self.coded, transient=uncertain)
-            if spec.field == "hash"
-            else NeRFField(spec.mlp, channels, coded=self.coded, transient=uncertain)
-        )
-        self.decoder = None if head else AffineDecoder(channels)
+        self.field = make_field(spec, box)
+        channels = spec.channels
+        self.decoder = None if spec.colour == "head" else AffineDecoder(channels)
         self.encoder: nn.Module | None = None
         self.content_encoder: nn.Module | None = None
         self.embedding: nn.Embedding | None = None
@@ -309,14 +311,22 @@ class SceneModel(nn.Module):
         assert appearance is not None
         return recolour(features, *self.colour_map(content or self.transform.content_statistics(features), appearance))
 
-    def colour_map(self, content: ContentStatistics, appearance: Tensor) -> ColourMap:
-        """Transform and decoder as one affine map for each of P appearances.
+    def colour_map(self, content: ContentStatistics | None, appearance: Tensor | None) -> ColourMap:
+        """Transform and decoder as one affine map for each of P appearances, for one set of statistics or P; without
+        an appearance, the decoder's alone (P = 1).
 
         Fused at points, sum_i w_i T(f_i) = W F + b sum_i w_i: the shift of T is the column of the channel that holds
         the sum of weights, and only the decoder's own shift is left.
+
+        Raises:
+            ValueError: the model gives colours, not features.
         """
-        assert self.transform is not None
-        assert self.decoder is not None
+        if self.decoder is None:
+            raise ValueError("model.colour: head gives colours at points; there is no map from features to colours")
+        if self.transform is None:
+            return ColourMap(self.decoder.linear.weight[None], self.decoder.linear.bias[None])
+        assert content is not None
+        assert appearance is not None
         W, b = self.transform.affine(content, self.transform.style_statistics(appearance))
         if self.fuses_points:
             A, shift = self.decoder.fold(torch.cat([W, b[..., None]], dim=-1), torch.zeros_like(b))
@@ -327,11 +337,11 @@ class SceneModel(nn.Module):
         self,
         features: Tensor,
         size: tuple[int, int],
-        policy: StatisticsPolicy,
+        policy: StatisticsPolicy | None = None,
         patch: int = 32,
         points: Tensor | None = None,
     ) -> ContentStatistics | None:
-        """Statistics of one view's features (N, C) in row order, h w = N, by policy.
+        """Statistics of one view's features (N, C) in row order, h w = N, by policy, by default the spec's.
 
         `view`: over all its rays. `patch`: over one patch x patch grid that spans it, as in training.
         `running`: the averages kept in training, the same for every view. None where the model has no transform.
@@ -339,9 +349,10 @@ class SceneModel(nn.Module):
         """
         if self.transform is None:
             return None
+        policy = policy or self.spec.statistics
         if policy == "running":
             if self.running_count == 0:
-                raise ValueError("statistics: running, but this model has not been trained")
+                raise ValueError("statistics: running, but this model has not been trained: it has no averages")
             return ContentStatistics(self.running_mean, self.running_gram)
         if self.fuses_points:
             if points is None:
@@ -435,7 +446,7 @@ class SceneModel(nn.Module):
         assert self.transient_embedding is not None
         code = self.transient_embedding(torch.tensor([photo], device=rays.near.device))
         parts = []
-        for part in self.chunks(rays, None, None):
+        for part in self.field.chunks(rays, None, None):
             with self.autocast(rays.near.device):
                 found = self.field.look_at_transients(self.field.place(part), code.expand(len(part.near), -1))
             parts.append(found.opacity())
@@ -447,17 +458,11 @@ class SceneModel(nn.Module):
         """The field along all rays, chunk by chunk, in one appearance code (1, CODE) where it reads one."""
         if self.coded and code is None:
             raise ValueError(f"model.appearance: {self.spec.appearance} needs the code of an appearance to render")
-        for part in self.chunks(rays, chunk, samples):
+        for part in self.field.chunks(rays, chunk, samples):
             codes = Codes(None if code is None else code.expand(len(part.near), -1))
             with self.autocast(rays.near.device):
                 march = self.field.march(part, samples=samples, codes=codes)
             yield march  # outside: a generator's context would stay open while its caller composites
-
-    def chunks(self, rays: Rays, chunk: int | None, samples: tuple[int, int] | None) -> Iterator[Rays]:
-        """The rays, `chunk` at a time, or as many as RENDER_POINTS allows."""
-        chunk = chunk or max(1, RENDER_POINTS // self.field.points_a_ray(samples))
-        for start in range(0, len(rays.near), chunk):
-            yield Rays(*(r[start : start + chunk] for r in rays))
 
     def picture(self, placed: Placed, code: Tensor, transient: Tensor | None) -> Tensor:
         """rgb (R, 3) at placed samples, with gradient to the codes (1, .): what a code is fitted with."""
@@ -508,6 +513,16 @@ def needs_other(spec: ModelSpec, weights: LossWeights) -> bool:
     """Whether a step looks at random other photos."""
     reads = spec.appearance in ("code", "crossray") and weights.appearance > 0 and weights.appearance_target == "other"
     return reads or (spec.appearance == "code" and weights.mode_seeking > 0)
+
+
+def make_field(spec: ModelSpec, box: Tensor) -> Field:
+    """The field as `spec` wants it; `box` (2, 3) as SceneModel takes it."""
+    head = spec.colour == "head"
+    channels = 3 if head else spec.channels
+    coded, uncertain = spec.appearance in ("embedding", "code"), spec.transient == "uncertainty"
+    if spec.field == "hash":
+        return HashField(spec.hash, channels, head, box, coded=coded, transient=uncertain)
+    return NeRFField(spec.mlp, channels, coded=coded, transient=uncertain)
 
 
 def make_transform(spec: ModelSpec) -> Transform:

@@ -18,7 +18,7 @@ SEED = 0
 def interval(values: Sequence[float]) -> tuple[float, float] | None:
     """The 95 % interval of the mean of `values`, one a photo. None for fewer than two, or where one is not finite.
 
-    Deterministic: the resamples are drawn from one seed.
+    Deterministic: the resamples are drawn from one seed. Memory: 160 kB a photo.
     """
     numbers = np.asarray(values, dtype=np.float64)
     if len(numbers) < 2 or not np.isfinite(numbers).all():
@@ -36,7 +36,7 @@ def paired_interval(a: Sequence[float], b: Sequence[float]) -> tuple[float, floa
     """
     if len(a) != len(b):
         raise ValueError(f"paired scores: {len(a)} and {len(b)} photos")
-    return interval(np.subtract(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)).tolist())
+    return interval([x - y for x, y in zip(a, b, strict=True)])
 
 
 def tied(a: Sequence[float], b: Sequence[float]) -> bool:

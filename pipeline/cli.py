@@ -93,10 +93,18 @@ def run(
     launcher: Annotated[str | None, typer.Option(help="local, torchrun or ray; over the job's own.")] = None,
 ) -> None:
     """Run a job file: shards if they are absent, training, evaluation. Again: goes on from where it was."""
+    from pipeline.study import read_kind
+
+    if read_kind(job) == "timing":
+        if launcher:
+            raise CrossrayError(f"--launcher: {job} is a timing, which starts its ranks itself; leave it out")
+        from pipeline.timing_job import load_timing
+
+        print_timing(load_timing(job, settings))
+        return
     from pipeline.config import load_job
     from pipeline.launch.home import go_home
     from pipeline.launch.run import run_job
-    from pipeline.study import read_kind
 
     if read_kind(job) == "study":
         if launcher:
@@ -164,7 +172,8 @@ def run_study_file(file: Path, settings: list[str]) -> None:
     """Run a study and print its tables; exit status 1 if some of its runs are not done."""
     from pipeline.launch.home import go_home
     from pipeline.launch.study import run_study
-    from pipeline.study import as_rich, captions, expand, load_study
+    from pipeline.study import expand, load_study
+    from pipeline.study_tables import as_rich, captions
 
     study = load_study(file, settings)
     scenes = {f"scenes.{run.scene}.scene.path": run.job.scene.path for run in expand(study)}
@@ -298,7 +307,9 @@ def verify(folder: Annotated[Path, typer.Argument(help="Folder of shards.")]) ->
 @app.command()
 def evaluate(
     run: Annotated[Path, typer.Argument(help="Folder of a trained run.")],
-    protocol: Annotated[list[str], typer.Option(help="For example crnerf-full@R4; may be given several times.")],
+    protocol: Annotated[
+        list[str], typer.Option(help="For example crnerf-full@R4 or nerfw-half@R1+fit; may be given several times.")
+    ],
     step: Annotated[int | None, typer.Option(help="Checkpoint to evaluate; the newest by default.")] = None,
 ) -> None:
     """Score a run on its test photos under a protocol; metrics.json and pictures go to RUN/eval."""
@@ -306,6 +317,37 @@ def evaluate(
 
     for result in evaluate_protocols(run, protocol, step):
         print_scores(result)
+
+
+@app.command()
+def timing(
+    what: Annotated[str, typer.Argument(help="inference (seconds an image) or training (minutes of the schedule).")],
+    settings: Settings = [],  # noqa: B006
+) -> None:
+    """Time methods on this machine, without a scene: the paper's timing tables. Keys to set: as in jobs/timing.yaml."""
+    from pipeline.config import nearest
+    from pipeline.timing_job import make_timing
+
+    known = ["inference", "training"]
+    if what not in known:
+        raise CrossrayError(f"timing {what}: there is nothing of this name to time{nearest(what, known)}")
+    print_timing(make_timing({"name": f"timing-{what}", "what": [what]}, settings, source="timing"))
+
+
+@app.command()
+def bake(
+    run: Annotated[Path, typer.Argument(help="Folder of a trained run.")],
+    appearance: Annotated[str, typer.Option(metavar="PHOTO", help="A photo of the scene, by name, or an image file.")],
+    towards: Annotated[str | None, typer.Option(metavar="PHOTO", help="A second one, to go towards.")] = None,
+    share: Annotated[float | None, typer.Option(help="How far, from 0 to 1; 0.5 by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for it; by default RUN/baked/<photo>.")] = None,
+    step: Annotated[int | None, typer.Option(help="Checkpoint to bake; the newest by default.")] = None,
+) -> None:
+    """Fold an appearance into a trained field: the same pictures, faster, without the appearance networks."""
+    from pipeline.bake import bake_run
+
+    folder = bake_run(run, appearance, towards, share, out, step)
+    print_line(f"{folder}: baked; {folder / 'preview.png'} shows it")
 
 
 @app.command()
@@ -317,6 +359,37 @@ def status(
 
     console = Console() if sys.stdout.isatty() else Console(width=1000)
     console.print(as_table([status_of(run) for run in find_runs(runs)]))
+
+
+@app.command()
+def tables(
+    runs: Annotated[
+        list[Path] | None, typer.Option(help="Folder of runs, at any depth; `runs` by default, where it exists.")
+    ] = None,
+    results: Annotated[
+        list[Path] | None, typer.Option(help="Folder of results; `benchmarks/results` by default, where it exists.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for results.md or results.html; printed by default.")] = None,
+    form: Annotated[str, typer.Option("--format", help="md or html.")] = "md",
+) -> None:
+    """Every table of the paper from recorded results, the published numbers beside ours; nothing is measured."""
+    from pipeline.beyond_tables import all_tables
+    from pipeline.config import nearest
+    from pipeline.files import atomic_write
+    from pipeline.page import FORMATS
+    from pipeline.provenance import command
+    from pipeline.results import read_results
+
+    if form not in FORMATS:
+        raise CrossrayError(f"--format {form}: there is no such format{nearest(form, list(FORMATS))}")
+    usual = [[path] if path.is_dir() else [] for path in (Path("runs"), Path("benchmarks/results"))]
+    found = read_results(runs or usual[0], results or usual[1])
+    text = FORMATS[form](all_tables(found), command())
+    if out is None:
+        sys.stdout.write(text)
+        return
+    atomic_write(out / f"results.{form}", text)
+    print_line(f"{out / f'results.{form}'}: {len(found.scores)} scores, {len(found.times)} times")
 
 
 @app.command()
@@ -333,6 +406,18 @@ def compare(
     for key in found.differing_keys:
         print_line(f"        job: {key}")
     raise typer.Exit(0 if found.same else 1)
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of a run, of a study, or of the quick start.")],
+    out: Annotated[Path | None, typer.Option(help="The page; by default report.html in the folder.")] = None,
+) -> None:
+    """Write one self-contained HTML page: scores, curves, pictures, appearances, masks, time, provenance."""
+    from pipeline.report.make import make_report
+
+    page = make_report(folder, out)
+    print_line(f"{page}: {page.stat().st_size / 1e6:.1f} MB")
 
 
 @app.command("import-checkpoint")
@@ -378,9 +463,35 @@ def schema() -> None:
 
 
 def print_scores(result: dict) -> None:
-    """A protocol's means as one line."""
-    scores = "  ".join(f"{name.upper()} {value:.4g}" for name, value in result["mean"].items())
+    """A protocol's means as one line, with their 95 % intervals where there are any."""
+    intervals = result.get("interval", {})
+
+    def shown(metric: str, mean: float) -> str:
+        found = intervals.get(metric)
+        return f"{metric.upper()} {mean:.4g}" + (f" [{found[0]:.4g}, {found[1]:.4g}]" if found else "")
+
+    scores = "  ".join(shown(metric, mean) for metric, mean in result["mean"].items())
     print_line(f"{result['protocol']} (step {result['step']}, {len(result['images'])} photos): {scores}")
+
+
+def print_timing(job: object) -> None:
+    """Run a timing and print its tables."""
+    from pipeline.launch.home import go_home
+    from pipeline.launch.timing import run_timing
+    from pipeline.timing import TIMING
+    from pipeline.timing_job import TimingJob
+    from pipeline.timing_table import LEGEND, tables
+
+    assert isinstance(job, TimingJob)
+    go_home({"runs": job.runs})
+    rows = run_timing(job)
+    if not rows:
+        return
+    console = Console() if sys.stdout.isatty() else Console(width=1000)  # nothing is wrapped in a file
+    for table in tables(rows):
+        console.print(table)
+    print_line(LEGEND)
+    print_line(str(job.folder / TIMING))
 
 
 def print_line(text: str) -> None:

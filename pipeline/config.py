@@ -380,8 +380,8 @@ def as_dict(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def explain(error: Any) -> str:
-    """One pydantic error as `key: what is wrong, nearest right name`."""
+def explain(error: Any, schema: type[BaseModel] = Job) -> str:
+    """One pydantic error of a job file with this schema as `key: what is wrong, nearest right name`."""
     location = [str(part) for part in error["loc"]]
     if not location:
         return error["msg"].removeprefix("Value error, ")
@@ -389,20 +389,20 @@ def explain(error: Any) -> str:
         location.pop()
     key = ".".join(location)
     if error["type"] in UNKNOWN:
-        return f"{key}: there is no such key{nearest(location[-1], keys_at(location[:-1]))}"
+        return f"{key}: there is no such key{nearest(location[-1], keys_at(location[:-1], schema))}"
     if error["type"] == "missing":
         return f"{key}: is missing"
     if key == "kind":
-        return f"kind: {error['input']!r} is not known (valid: train, study, reeval)"
+        return f"kind: {error['input']!r} is not known (valid: train, study, reeval, timing)"
     return f"{key}: {error['msg'][:1].lower()}{error['msg'][1:]} (got {error['input']!r})"
 
 
-def keys_at(location: list[str]) -> list[str]:
+def keys_at(location: list[str], schema: type[BaseModel] = Job) -> list[str]:
     """The valid keys of the section at `location`."""
-    schema = Job.model_json_schema()
-    node = schema
+    whole = schema.model_json_schema()
+    node = whole
     for part in location:
-        node = resolve(node.get("properties", {}).get(part, {}), schema)
+        node = resolve(node.get("properties", {}).get(part, {}), whole)
     return list(node.get("properties", {}))
 
 

@@ -10,11 +10,9 @@ A lock a checkpoint keeps two processes from evaluating the same one.
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import logging
 import os
-import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -30,6 +28,7 @@ from PIL import Image
 from model.scene_model import SceneModel
 from pipeline.best import lock_of_best, write_best
 from pipeline.board import write_evaluation
+from pipeline.bootstrap import interval
 from pipeline.checkpoint import (
     META,
     MODEL,
@@ -43,13 +42,13 @@ from pipeline.checkpoint import (
 from pipeline.config import Job
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write
-from pipeline.judge import Judge, Shared, depth_picture, fit_colours, lpips_at, lpips_usable
+from pipeline.judge import Judge, Shared, depth_picture, lpips_at, lpips_usable
 from pipeline.lpips import LPIPS, VARIABLE
 from pipeline.metrics import to_8bit
 from pipeline.photos import Photos
 from pipeline.progress import Progress
-from pipeline.protocol import appearance_from, check_protocol, parse_protocol, samples_of
-from pipeline.provenance import device_name
+from pipeline.protocol import appearance_from, check_protocol, parse_protocol, policy_of, samples_of
+from pipeline.provenance import device_name, provenance
 from pipeline.runs import checkpoint_of, job_of, model_of, photos_of
 from pipeline.truth import truth_of
 
@@ -80,12 +79,20 @@ class Views(NamedTuple):
     weights: Path | None  # of LPIPS, where the environment of whoever asks for the evaluation names them
 
 
+class Row(NamedTuple):
+    """What became of one view under one protocol."""
+
+    metrics: dict[str, Any]  # its name and key, and its scores
+    appearance_seconds: float
+    render_seconds: float
+
+
 class Scores(NamedTuple):
     """What became of a task; by protocol."""
 
     run: Path
     step: int
-    rows: dict[str, dict[int, dict[str, Any]]]  # photo -> metrics
+    rows: dict[str, dict[int, Row]]  # by photo
     masks: dict[str, dict[str, float]]
     seconds: dict[str, float]
     device: str
@@ -106,28 +113,26 @@ def score_views(task: Views) -> Scores:
             protocol = parse_protocol(name)[0]
             landmark = truth_of(task.job, photos) if protocol.truth == "clean" else None
             judges[name] = Judge(model, photos, protocol, landmark, shared)
-        rows: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in judges}
+        rows: dict[str, dict[int, Row]] = {name: {} for name in judges}
         seconds = dict.fromkeys(judges, 0.0)
         for index in task.photos:
             for name, judge in judges.items():
                 began = time.perf_counter()
                 folder = results_folder(task.job.run, name, task.step)
-                rows[name][index] = score_view(judge, index, folder, name, lpips if name in task.lpips else None)
+                rows[name][index] = score_view(judge, index, folder, lpips if name in task.lpips else None)
                 seconds[name] += time.perf_counter() - began
         masks = {name: judge.masks() for name, judge in judges.items()} if task.masks else {}
         return Scores(task.job.run, task.step, rows, masks, seconds, device_name(next(model.parameters()).device))
 
 
-def score_view(judge: Judge, index: int, folder: Path, name: str, lpips: LPIPS | None) -> dict[str, Any]:
+def score_view(judge: Judge, index: int, folder: Path, lpips: LPIPS | None) -> Row:
     """One view under one protocol: its pictures in `folder`, its metrics."""
-    view, picture = judge.render(index)
-    if parse_protocol(name)[2]:
-        picture = fit_colours(picture, judge.photos.image(index))
-    prediction, key = to_8bit(picture, judge.protocol.rounding), judge.photos.records[index].key
-    row = judge.score(prediction, index, lpips)
+    judged = judge.render(index)
+    prediction, key = to_8bit(judged.picture, judge.protocol.rounding), judge.photos.records[index].key
+    metrics = judge.score(prediction, index, lpips)
     save_png(folder / f"{key}.png", prediction)
-    save_png(folder / f"{key}.depth.png", depth_picture(view))
-    return row
+    save_png(folder / f"{key}.depth.png", depth_picture(judged.view))
+    return Row(metrics, judged.appearance_seconds, judged.render_seconds)
 
 
 @contextmanager
@@ -158,8 +163,20 @@ def loaded(task: Views) -> tuple[SceneModel, Photos]:
             raise CheckpointGone(f"{folder}: it was removed before it was evaluated") from error
         if checkpoint.meta["sha256"][MODEL] != task.checkpoint:
             raise CheckpointGone(f"{folder}: it was written anew while it was being evaluated")
-        _latest[key] = model_of(task.job, checkpoint), photos_of(task.job, checkpoint)
+        model = model_of(task.job, checkpoint)
+        check_finite(model, folder)
+        _latest[key] = model, photos_of(task.job, checkpoint)
     return _latest[key]
+
+
+def check_finite(model: SceneModel, folder: Path) -> None:
+    """CrossrayError where a weight is NaN or infinite: what it would render is nothing, or nothing that says why."""
+    for name, value in model.state_dict().items():
+        if not value.isfinite().all():
+            raise CrossrayError(
+                f"{folder}: {name} holds values that are not finite, so nothing can be scored; evaluate an earlier "
+                "checkpoint (--step), and see the run's losses for when that began"
+            )
 
 
 # ---------------------------------------------------------------------------------------------------- evaluations
@@ -228,9 +245,12 @@ class Evaluation:
         protocol, spec = parse_protocol(name)[0], self.job.model
         found = {index: row for part in parts for index, row in part.rows.get(name, {}).items()}
         rows = [found[index] for index in self.indices]
-        mean = {k: float(np.mean([r[k] for r in rows])) for k in rows[0] if k not in ("name", "key")}
+        images = [row.metrics for row in rows]
+        values = {k: [image[k] for image in images] for k in images[0] if k not in ("name", "key")}
+        mean = {metric: float(np.mean(of)) for metric, of in values.items()}
         for part in parts:
             mean |= part.masks.get(name, {})
+        origin = provenance()
         return {
             "protocol": name,
             "definition": protocol.model_dump(mode="json"),
@@ -239,13 +259,23 @@ class Evaluation:
             "method": self.job.method,
             "samples": list(samples_of(spec, protocol) or ()) or "as in training",
             "appearance_from": appearance_from(spec, protocol),
+            "statistics": policy_of(spec),
             "mean": mean,
-            "images": rows,
+            "interval": {metric: as_list(interval(values.get(metric, ()))) for metric in mean},
+            "images": images,
             "seconds": sum(part.seconds.get(name, 0.0) for part in parts),
+            "appearance_seconds": float(np.mean([row.appearance_seconds for row in rows])),
+            "render_seconds": float(np.mean([row.render_seconds for row in rows])),
             "device": ", ".join(sorted({part.device for part in parts})),
-            "versions": {p: importlib.metadata.version(p) for p in ("torch", "numpy", "pillow", "scikit-image")},
-            "python": platform.python_version(),
+            "versions": origin["versions"],
+            "python": origin["python"],
+            "provenance": origin,
         }
+
+
+def as_list(found: tuple[float, float] | None) -> list[float] | None:
+    """As JSON gives it back."""
+    return None if found is None else list(found)
 
 
 def prepare(job: Job, checkpoint: Checkpoint, protocols: Sequence[str]) -> Evaluation:
@@ -310,7 +340,7 @@ def carry_out(evaluation: Evaluation, mapper: Mapper) -> list[dict[str, Any]]:
     try:
         for part in mapper(score_views, evaluation.begin()):
             parts.append(part)
-            psnrs = [row["psnr"] for p in parts for row in p.rows.get(first, {}).values()]
+            psnrs = [row.metrics["psnr"] for p in parts for row in p.rows.get(first, {}).values()]
             progress.update(len(psnrs) / len(evaluation.indices), f"PSNR {np.mean(psnrs):.2f}" if psnrs else "")
     finally:
         progress.close()

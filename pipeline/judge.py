@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,13 +15,13 @@ import torch
 from model.methods import smallest_side
 from model.scene_model import SceneModel
 from pipeline.errors import CrossrayError
-from pipeline.fit import FitRecipe, fit_code
+from pipeline.fit import FitRecipe, fit_code, fit_map
 from pipeline.landmark import Landmark
 from pipeline.lpips import LPIPS, VARIABLE, find_lpips, read_lpips
 from pipeline.metrics import psnr, ssim_11, ssim_window3
 from pipeline.photos import Photos
 from pipeline.protocol import Protocol, appearance_from, samples_of
-from pipeline.render import View, colour_view, read_appearance, render_picture, render_view
+from pipeline.render import View, colour_view, read_appearance, render_view
 from pipeline.truth import elsewhere, mask_iou, reduced
 
 log = logging.getLogger("crossray")
@@ -29,13 +30,31 @@ LPIPS_SIDE = 31  # pixels; AlexNet has nothing left of a smaller picture
 MASK_PHOTOS = 32  # training photos over which masks are compared with the truth, at most
 
 
+class Judged(NamedTuple):
+    """A test photo's view in the appearance that the protocol lets the model see, and what it took."""
+
+    view: View
+    picture: np.ndarray  # (h, w, 3) in [0, 1]
+    appearance_seconds: float  # encoding, fitting
+    render_seconds: float  # the field, the colours
+
+
+class Seen(NamedTuple):
+    """What a protocol lets the model see of a test photo."""
+
+    source: int  # the photo whose view this is
+    image: np.ndarray  # uint8 (h, w, 3)
+    columns: int  # of the image, from the left, that a fit may look at
+    reference: np.ndarray  # for the encoder: uint8 (h', w', 3)
+
+
 @dataclass
 class Shared:
-    """What the protocols of one checkpoint need not do twice."""
+    """What the protocols of one checkpoint need not do twice, with the seconds that it took."""
 
-    codes: dict[tuple[FitRecipe, int, str], torch.Tensor] = field(default_factory=dict)
+    codes: dict[tuple[FitRecipe, int, str], tuple[torch.Tensor, float]] = field(default_factory=dict)
     """(recipe, photo, what it was read from) -> fitted code."""
-    views: dict[tuple[int, tuple[int, int] | None], View] = field(default_factory=dict)
+    views: dict[tuple[int, tuple[int, int] | None], tuple[View, float]] = field(default_factory=dict)
     """(photo, samples) -> view, of the latest photo alone: it takes as much memory as all else."""
 
 
@@ -58,40 +77,111 @@ class Judge:
         self.model, self.photos, self.protocol, self.landmark = model, photos, protocol, landmark
         self.shared = shared or Shared()
         self.appearance_from = appearance_from(model.spec, protocol)
+        self.samples = samples_of(model.spec, protocol)
 
-    def render(self, index: int) -> tuple[View, np.ndarray]:
-        """A test photo's view in the appearance that the protocol lets the model see."""
-        camera, appearance = self.photos.records[index], self.appearance(index)
-        samples = samples_of(self.model.spec, self.protocol)
+    def render(self, index: int) -> Judged:
+        """A test photo's view in the appearance that the protocol lets the model see.
+
+        Raises:
+            CrossrayError: the model gives no picture of it: values that are not numbers.
+        """
         if self.model.coded:  # the field itself reads the appearance: another view for each
-            return render_picture(self.model, camera, appearance, samples)
-        key = (index, samples)
+            appearance, reading = self.appearance(index)
+            began = self.now()
+            view = render_view(self.model, self.photos.records[index], appearance, samples=self.samples)
+            rendering = self.now() - began
+            self.check_numbers(view.features, "its rendered view", index)
+        else:
+            view, rendering = self.view(index)
+            self.check_numbers(view.features, "its rendered view", index)
+            appearance, reading = self.appearance(index, view)
+        began = self.now()
+        picture = colour_view(self.model, view, appearance)
+        rendering += self.now() - began
+        self.check_numbers(torch.from_numpy(picture), "its picture", index)
+        if self.protocol.suffix == "affine":
+            began = self.now()
+            picture = fit_colours(picture, self.photos.image(index))
+            reading += self.now() - began
+        return Judged(view, picture, reading, rendering)
+
+    def view(self, index: int) -> tuple[View, float]:
+        """A test photo's view, whatever its appearance, and the seconds that it took when it was rendered."""
+        key = (index, self.samples)
         if key not in self.shared.views:
             self.shared.views.clear()
-            self.shared.views[key] = render_view(self.model, camera, samples=samples)
-        view = self.shared.views[key]
-        return view, colour_view(self.model, view, appearance)
+            began = self.now()
+            view = render_view(self.model, self.photos.records[index], samples=self.samples)
+            self.shared.views[key] = view, self.now() - began
+        return self.shared.views[key]
 
-    def appearance(self, index: int) -> torch.Tensor | None:
-        """F^a of a test photo."""
-        if self.model.spec.appearance == "none":
-            return None
-        source, image, reference = index, self.photos.image(index), self.photos.reference(index)
+    def now(self) -> float:
+        """Seconds; all that the device was given is done."""
+        device = next(self.model.parameters()).device
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter()
+
+    def seen(self, index: int) -> Seen:
+        """What may be seen of a test photo. Nothing is ever fitted to the scored half of it."""
         if self.protocol.appearance == "elsewhere":
             source = elsewhere(self.photos, index)
             image = self.clean(source, index)
             reference = reduced(image, self.photos.manifest.reference_downscale)
+            return Seen(source, image, image.shape[1], reference)
+        image, reference = self.photos.image(index), self.photos.reference(index)
         if self.appearance_from == "left":
             reference = left_half(reference)
-        if self.model.embedding is None:
-            self.check_reference(reference, index)
-            return read_appearance(self.model, reference)
-        codes, key = self.shared.codes, (self.recipe, index, self.appearance_from)
+        return Seen(index, image, left_half(image).shape[1], reference)
+
+    def appearance(self, index: int, view: View | None = None) -> tuple[torch.Tensor | None, float]:
+        """F^a of a test photo, and the seconds that it took to read or fit it.
+
+        Args:
+            view: of the photo, where appearance acts on what is rendered.
+        """
+        if self.model.spec.appearance == "none":
+            return None, 0.0
+        seen = self.seen(index)
+        if self.model.embedding is not None:
+            return self.learned_code(seen, index)
+        self.check_reference(seen.reference, index)
+        began = self.now()
+        appearance = read_appearance(self.model, seen.reference)
+        self.check_numbers(appearance, "the appearance that is read for it", index)
+        if self.protocol.suffix == "fit":
+            assert appearance is not None
+            appearance = self.fitted(appearance, seen, index, view)
+            self.check_numbers(appearance, "the appearance that is fitted for it", index)
+        return appearance, self.now() - began
+
+    def learned_code(self, seen: Seen, index: int) -> tuple[torch.Tensor, float]:
+        """A code for the photo, fitted from the mean of those of the training photos."""
+        recipe = self.protocol.fit[self.model.spec.field]
+        codes, key = self.shared.codes, (recipe, index, self.appearance_from)
         if key not in codes:
-            columns = left_half(image).shape[1] if self.appearance_from == "left" else image.shape[1]
-            camera = self.photos.records[source]
-            codes[key] = fit_code(self.model, image, camera, columns, self.recipe, seed=index)
+            camera, began = self.photos.records[seen.source], self.now()
+            code = fit_code(self.model, seen.image, camera, seen.columns, recipe, seed=index)
+            codes[key] = code, self.now() - began
         return codes[key]
+
+    def fitted(self, appearance: torch.Tensor, seen: Seen, index: int, view: View | None) -> torch.Tensor:
+        """`appearance`, as it was read from the photo, fitted further (`+fit`)."""
+        recipe, camera = self.protocol.fit_read[self.model.spec.field], self.photos.records[seen.source]
+        if self.model.coded:
+            return fit_code(self.model, seen.image, camera, seen.columns, recipe, seed=index, start=appearance)
+        if view is None or seen.source != index:
+            view = render_view(self.model, camera, samples=self.samples)
+        return fit_map(self.model, view, seen.image, seen.columns, recipe, appearance, seed=index)
+
+    def check_numbers(self, values: torch.Tensor | None, what: str, index: int) -> None:
+        """CrossrayError where the model gives NaN for a photo: no metric of it means anything."""
+        bad = 0 if values is None else int(values.isnan().sum())
+        if values is not None and bad:
+            raise CrossrayError(
+                f"{self.photos.records[index].name}: {bad} of {values.numel()} numbers of {what} are NaN, so nothing "
+                "can be scored; an earlier checkpoint may do (--step)"
+            )
 
     def check_reference(self, reference: np.ndarray, index: int) -> None:
         """CrossrayError where what may be seen of a photo is too small for the appearance network."""
@@ -102,11 +192,6 @@ class Judge:
                 f"({self.appearance_from}), and model.encoder: released reads no side under {least}; cut the shards "
                 "with a smaller scene.reference_downscale"
             )
-
-    @property
-    def recipe(self) -> FitRecipe:
-        """How codes are fitted."""
-        return self.protocol.fit[self.model.spec.field]
 
     def clean(self, view: int, light: int) -> np.ndarray:
         """The landmark in the view of one photo and the light of another, nobody there."""
@@ -134,13 +219,18 @@ def left_half(picture: np.ndarray) -> np.ndarray:
     return picture[:, : picture.shape[1] - picture.shape[1] // 2]
 
 
+def first_scored(width: int, protocol: Protocol) -> int:
+    """The first column that is scored of a picture of this width."""
+    return width // 2 if protocol.scored == "right" else 0
+
+
 def lpips_usable(photos: Photos, indices: tuple[int, ...], protocol: Protocol) -> bool:
     """Whether the weights of LPIPS are found and all pictures are large enough; if not, the log says why."""
     if find_lpips() is None:
         warn_once(f"LPIPS is left out: no weights found; {VARIABLE}=/path/to/lpips_alex.npz names them")
         return False
     for record in (photos.records[i] for i in indices):
-        width = record.width // 2 if protocol.scored == "right" else record.width
+        width = record.width - first_scored(record.width, protocol)
         if min(record.height, width) < LPIPS_SIDE:
             warn_once(f"LPIPS is left out: what is scored of {record.name} has a side under {LPIPS_SIDE} pixels")
             return False
@@ -169,7 +259,7 @@ def score(
     prediction: np.ndarray, truth: np.ndarray, protocol: Protocol, lpips: LPIPS | None, name: str
 ) -> dict[str, float]:
     """The metrics of one 8-bit prediction against the 8-bit truth, both (h, w, 3); `name` is for messages."""
-    start = truth.shape[1] // 2 if protocol.scored == "right" else 0
+    start = first_scored(truth.shape[1], protocol)
     prediction, truth = np.ascontiguousarray(prediction[:, start:]), np.ascontiguousarray(truth[:, start:])
     ssim, least = (ssim_window3, 3) if protocol.ssim == "window3" else (ssim_11, 11)
     if min(truth.shape[:2]) < least:

@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import importlib
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
@@ -36,9 +34,6 @@ CONVOLUTIONS = {
     "10": (256, 256, 3, 1, 1),
 }
 POOLED_BEFORE = ("3", "6")
-
-# What the two readers raise on files that are damaged or something else altogether.
-UNREADABLE = (OSError, ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, SafetensorError)
 
 
 class LPIPS(nn.Module):
@@ -117,7 +112,7 @@ def read_lpips(path: Path) -> LPIPS:
         else:
             with np.load(path, allow_pickle=False) as arrays:
                 weights = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-    except UNREADABLE as error:
+    except Exception as error:  # zipfile, zlib, numpy and safetensors each raise what they like on a damaged file
         raise CrossrayError(f"{path} is no readable .npz or .safetensors file of weights: {error}") from error
     return LPIPS(weights, str(path))
 

@@ -36,8 +36,14 @@ def provenance() -> dict[str, Any]:
 
 def command() -> str:
     """The command line of this process, as a shell takes it."""
-    program, *words = sys.argv
-    return shlex.join([Path(program).name, *words])
+    program, words = Path(sys.argv[0]), sys.argv[1:]
+    if program.name == "__main__.py":
+        start = ["python", "-m", program.parent.name]
+    elif program.suffix == ".py":
+        start = ["python", str(Path(program.parent.name, program.name))]
+    else:
+        start = [program.name]
+    return shlex.join([*start, *words])
 
 
 @cache

@@ -29,6 +29,7 @@ from pipeline.photos import Photos, open_photos
 from pipeline.progress import shown
 from pipeline.render import View, colour_view, predicted_mask, read_appearance, render_view
 from pipeline.report import Row, write_overview, write_report
+from pipeline.report.words import count
 from pipeline.runs import load_run
 from pipeline.shards import cut_shards
 from pipeline.truth import mask_iou
@@ -127,10 +128,9 @@ def run_quickstart(
         "size": size,
     }
     rows = scene.rows()
-    write_overview(out / "overview.png", rows)
+    write_overview(out / "overview.png", [row.pictures for row in rows])
     summary["total_seconds"] = time.perf_counter() - began
-    scores = [(key, f"{summary[key]:.3f}", text) for key, text in SCORES.items()]
-    report = write_report(out / "report.html", "Crossray: the landmark without its tourists", scores, rows)
+    report = report_of(summary, rows, out / "report.html")
     atomic_write(out / "summary.json", json.dumps(summary, indent=2))
     print_summary(console, out, summary, report)
     return summary
@@ -190,6 +190,7 @@ class Scored:
                         "true mask": self.landmark.mask(name).astype(np.uint8) * 255,
                         "depth": depth_picture(view),
                     },
+                    compare=("clean truth", "Crossray"),
                 )
             )
         return rows
@@ -216,6 +217,34 @@ class Scored:
     def nerf_picture(self, index: int) -> np.ndarray:
         """Plain NeRF's 8-bit picture of a photo's view."""
         return to_8bit(colour_view(self.nerf, render_view(self.nerf, self.photos.records[index]), None), "round")
+
+
+def report_of(summary: dict[str, Any], rows: list[Row], path: Path) -> Path:
+    """The page of the quick start; returns its path."""
+    scores = [(key, "-" if summary[key] is None else f"{summary[key]:.3f}", text) for key, text in SCORES.items()]
+    lead = (
+        f"{summary['train_steps']:,} steps of {summary['photos']['train']} photos on {summary['device']}, "
+        f"{count(summary['ranks'], 'process', 'processes')}, and plain NeRF beside it with the same field and the same "
+        "seconds."
+    )
+    return write_report(path, "The landmark without its tourists", scores, rows, lead)
+
+
+def report_again(out: Path, path: Path) -> Path:
+    """The page of a quick start that was run before, as the file `path`; returns it.
+
+    Raises:
+        CrossrayError: its runs, its shards or its summary cannot be used.
+    """
+    try:
+        summary = json.loads((out / "summary.json").read_text())
+        ours, nerf = (quickstart_job(out, m, summary["ranks"], summary["train_seconds"]) for m in ("crossray", "nerf"))
+        return report_of(summary, Scored(out, ours, nerf).rows(), path)
+    except (ValueError, KeyError, TypeError) as error:
+        raise CrossrayError(
+            f"{out / 'summary.json'}: is not what the quick start writes ({type(error).__name__}: {error}); "
+            f"`crossray quickstart --out {out}` writes it anew"
+        ) from None
 
 
 def print_summary(console: Console, out: Path, summary: dict[str, Any], report: Path) -> None:

@@ -1,24 +1,31 @@
-"""Pictures of a trained scene: a view's features are rendered once, then coloured for any appearance.
+"""Pictures of a trained scene: a view's features are rendered once, then coloured for any number of appearances.
 
-Where a model gives its field an appearance code (NeRF-W, Ha-NeRF), a view is rendered anew for each appearance.
+Whose statistics an appearance is formed with is the model's own policy (`model.statistics`), unless a caller asks for
+another one. Where a model gives its field an appearance code (NeRF-W, Ha-NeRF), a view is rendered anew for each
+appearance.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from model.appearance.crossray import ContentStatistics
+from model.bake import Baked
 from model.cameras import patch_grid, pixel_rays
 from model.fields.base import Rays
-from model.scene_model import SceneModel, StatisticsPolicy
+from model.methods import StatisticsPolicy
+from model.scene_model import ColourMap, SceneModel
 from pipeline.batches import as_tensor
+from pipeline.errors import CrossrayError
 from pipeline.photos import Photos
 from pipeline.shards import CameraRecord
 
 STATISTICS_SIDE = 32  # rays a side of the grid whose points give the statistics of appearance that is fused at points
+RECOLOURED = 2**18  # colour values that are computed at once when a view is re-coloured: 1 MiB, what a core caches
 
 
 class View(NamedTuple):
@@ -89,12 +96,109 @@ def training_appearance(model: SceneModel, photos: Photos, index: int) -> Tensor
     return model.embedding(number)
 
 
+def interpolated(a: Tensor, b: Tensor, share: float) -> Tensor:
+    """F^a between two appearances, linear (paper, section on interpolation): `a` at share 0, `b` at 1, exactly.
+
+    Raises:
+        CrossrayError: `share` is outside [0, 1].
+    """
+    if not 0 <= share <= 1:
+        raise CrossrayError(f"share {share}: it must lie within 0 (the first appearance) and 1 (the second)")
+    return torch.lerp(a, b, share)
+
+
+@torch.no_grad()
+def statistics_of(
+    model: SceneModel, view: View | None, policy: StatisticsPolicy | None = None
+) -> ContentStatistics | None:
+    """A view's content statistics by a policy, by default the model's own; None where the model has no transform.
+
+    Args:
+        view: None will do for `running`.
+
+    Raises:
+        CrossrayError: `running`, and the model has no averages: it was imported, or not trained.
+    """
+    policy = policy or model.spec.statistics
+    if model.transform is not None and policy == "running" and model.running_count == 0:
+        raise CrossrayError(
+            "model.statistics: running, but this checkpoint holds no averages: it was not trained here for a single "
+            "step; --set model.statistics=view"
+        )
+    if model.transform is None:
+        return None
+    if view is None:
+        return model.content_statistics(model.running_mean, (1, 1), policy)
+    return model.content_statistics(view.features, view.size, policy, points=view.points)
+
+
+@torch.no_grad()
+def grid_statistics(model: SceneModel, camera: CameraRecord) -> ContentStatistics:
+    """Content statistics over a grid of STATISTICS_SIDE^2 rays that spans a view, or over the points on them where
+    appearance is fused there; nothing else of the view is rendered. ValueError for a model without a transform.
+    """
+    if model.transform is None:
+        raise ValueError("a model without a transform takes no statistics")
+    rows, cols, _ = patch_grid(STATISTICS_SIDE, 1.0, 0.0, 0.0, camera.height, camera.width)
+    chosen = (rows * camera.width + cols).to(next(model.parameters()).device)
+    rays = Rays(*(r[chosen] for r in view_rays(camera, model.spec.pixel_center, chosen.device)))
+    seen = model.point_features(rays) if model.fuses_points else model.render(rays).features
+    return model.transform.content_statistics(seen[None])
+
+
+@torch.no_grad()
+def view_colours(
+    model: SceneModel, view: View | None, appearances: Tensor | None, policy: StatisticsPolicy | None = None
+) -> ColourMap:
+    """The maps from a view's features to its colours in P appearances F^a, for `recoloured` and, of one appearance with
+    statistics that no view decides, for `bake`. Arguments as `statistics_of`.
+
+    Raises:
+        ValueError: the field gives colours, and there is no map.
+    """
+    return model.colour_map(statistics_of(model, view, policy), appearances)
+
+
+@torch.no_grad()
+def recoloured(view: View, colours: ColourMap, rounding: Literal["truncate", "round"] = "round") -> list[np.ndarray]:
+    """The view in P appearances, a uint8 picture (h, w, 3) each: sigmoid(A F + b) in 8 bits.
+
+    Nothing is rendered. Memory: the pictures, and RECOLOURED values (but one pixel in all appearances at least). Beside
+    `colour_view` and `to_8bit` the products are summed in another order: where a value falls on the border between two
+    levels, within float32's rounding, they can differ by this one level.
+
+    Raises:
+        ValueError: A is not (P, 3, C) for the view's features (h w, C), or a colour is not a number.
+    """
+    (height, width), (A, b) = view.size, colours
+    if A.ndim != 3 or A.shape[1:] != (3, view.features.shape[1]):
+        raise ValueError(f"features {tuple(view.features.shape)} and A {tuple(A.shape)} do not fit each other")
+    # truncate: the level below. Adding a half first makes rounding of it; ties lie within float32's rounding anyway.
+    half = 0.5 if rounding == "round" else 0.0
+    weight, bias = A.flatten(0, 1).T, b.flatten()  # as it lies in memory: products are 3 times as fast as copied
+    pictures = torch.empty(len(A), height * width, 3, dtype=torch.uint8, device=A.device)
+    block = max(1, RECOLOURED // weight.shape[1])
+    check = A.new_zeros(())  # NaN as soon as one value is
+    for start in range(0, height * width, block):
+        values = (view.features[start : start + block] @ weight).add_(bias)
+        check += values.sum()
+        levels = values.sigmoid_().mul_(255).add_(half).to(torch.uint8)
+        pictures[:, start : start + block] = levels.unflatten(1, (len(A), 3)).transpose(0, 1)
+    if check.isnan():
+        raise ValueError("the picture holds NaN")
+    return list(pictures.view(len(A), height, width, 3).cpu().numpy())
+
+
 @torch.no_grad()
 def colour_view(
-    model: SceneModel, view: View, appearance: Tensor | None, policy: StatisticsPolicy = "view"
+    model: SceneModel, view: View, appearance: Tensor | None, policy: StatisticsPolicy | None = None
 ) -> np.ndarray:
-    """The view in one appearance, float32 (h, w, 3) in [0, 1]; with codes, in the one that it was rendered with."""
-    content = model.content_statistics(view.features, view.size, policy, points=view.points)
+    """The view in one appearance, float32 (h, w, 3) in [0, 1]; with codes, in the one that it was rendered with.
+
+    Args:
+        policy: whose statistics; by default the model's own policy. CrossrayError as `statistics_of`.
+    """
+    content = statistics_of(model, view, policy)
     colours = model.colours(view.features[None], appearance, content)[0]
     return colours.clamp(0, 1).view(*view.size, 3).cpu().numpy()
 
@@ -105,6 +209,17 @@ def render_picture(
     """A view in one appearance, whatever way the model uses it."""
     view = render_view(model, camera, appearance if model.coded else None, samples=samples)
     return view, colour_view(model, view, appearance)
+
+
+def render_baked(
+    baked: Baked, camera: CameraRecord, *, stride: int = 1, samples: tuple[int, int] | None = None
+) -> tuple[View, np.ndarray]:
+    """A view of a baked model, whose features are its colours, and the same as float32 (h, w, 3) in (0, 1)."""
+    rays = view_rays(camera, baked.spec.pixel_center, baked.b.device, stride)
+    rendering = baked.render(rays, samples=samples)
+    size = (len(range(stride // 2, camera.height, stride)), len(range(stride // 2, camera.width, stride)))
+    view = View(size, rendering.features, rendering.depth.view(size), rendering.accumulation.view(size))
+    return view, rendering.features.view(*size, 3).cpu().numpy()
 
 
 def predicted_mask(model: SceneModel, photos: Photos, index: int, stride: int = 1) -> np.ndarray | None:

@@ -105,8 +105,7 @@ def pose_photos(
     """The scene in scene units, from the model in COLMAP units."""
     points = np.stack([p.xyz for p in model.points3D.values()])
     poses = [image.cam_from_world().matrix() for image in images]
-    bounds = [depth_bounds(points, w2c, i.name) for w2c, i in zip(poses, images, strict=True)]
-    scale = float(np.float32(max(far for _, far in bounds)) / FAR)
+    bounds, scale, box = measure(points, poses, [image.name for image in images])
     photos = []
     for i, (image, w2c, (near, far)) in enumerate(zip(images, poses, bounds, strict=True)):
         camera = model.cameras[image.camera_id]
@@ -125,8 +124,21 @@ def pose_photos(
                 far=far / scale,
             )
         )
-    box = np.percentile(points / scale, [1, 99], axis=0).astype(np.float32)
     return Scene(name, root, tuple(photos), scale, box, len(points))
+
+
+def measure(
+    points: np.ndarray, poses: list[np.ndarray], names: list[str]
+) -> tuple[list[tuple[float, float]], float, np.ndarray]:
+    """Depth bounds of every photo in COLMAP units, COLMAP units per scene unit, and the box of the points in scene
+    units, from `points` (P, 3) and world-to-camera `poses` (3, 4) in COLMAP units.
+
+    Raises:
+        SceneError: as `depth_bounds`.
+    """
+    bounds = [depth_bounds(points, w2c, name) for w2c, name in zip(poses, names, strict=True)]
+    scale = float(np.float32(max(far for _, far in bounds)) / FAR)
+    return bounds, scale, np.percentile(points / scale, [1, 99], axis=0).astype(np.float32)
 
 
 def depth_bounds(points: np.ndarray, w2c: np.ndarray, name: str) -> tuple[float, float]:

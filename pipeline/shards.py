@@ -453,7 +453,7 @@ def decode_photo(data: bytes, photo: ScenePhoto) -> np.ndarray:
                     f"{where} has {image.width} x {image.height} pixels and its camera {photo.width} x "
                     f"{photo.height}: use the photos that the model was made from"
                 )
-            return _to_rgb(image, where)
+            return to_rgb(image, where)
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
         raise ShardError(f"{where} cannot be read ({error}): replace it, or take it out of the split table") from error
 
@@ -470,7 +470,7 @@ def decode_mask(data: bytes, photo: ScenePhoto) -> np.ndarray:
         raise ShardError(f"{where} cannot be read ({error})") from error
 
 
-def _to_rgb(image: Image.Image, where: str) -> np.ndarray:
+def to_rgb(image: Image.Image, where: str) -> np.ndarray:
     """uint8 (h, w, 3) of any 8- or 16-bit picture; gray is repeated."""
     if image.mode.startswith("I;16"):
         return np.repeat(_to_8_bits(image)[..., None], 3, axis=2)

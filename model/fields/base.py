@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -9,6 +10,8 @@ from torch import Tensor, nn
 
 from model.transient.uncertainty import Transient
 from model.volume import composite, joint_weights
+
+RENDER_POINTS = 2**18  # points that go through a field at once when no gradient is needed
 
 
 class Rays(NamedTuple):
@@ -124,6 +127,25 @@ class Field(nn.Module):
         """Points at which the field is evaluated for each ray, at most, in one pass of its networks."""
         raise NotImplementedError
 
+    def chunks(self, rays: Rays, chunk: int | None, samples: tuple[int, int] | None) -> Iterator[Rays]:
+        """The rays, `chunk` at a time, or as many as RENDER_POINTS allows."""
+        chunk = chunk or max(1, RENDER_POINTS // self.points_a_ray(samples))
+        for start in range(0, len(rays.near), chunk):
+            yield Rays(*(r[start : start + chunk] for r in rays))
+
+    def folded(self, A: Tensor, shift: Tensor) -> Field:
+        """A copy of this field that gives A f + shift for each feature f, of points and background alike: the same
+        places and weights with K channels. It shares no memory with this one, and has no transient field.
+
+        Args:
+            A: (K, C).
+            shift: (K,).
+
+        Raises:
+            ValueError: this field reads appearance codes, or gives colours, which a sigmoid has bounded.
+        """
+        raise NotImplementedError
+
     def place(
         self, rays: Rays, generator: torch.Generator | None = None, samples: tuple[int, int] | None = None
     ) -> Placed:
@@ -175,6 +197,15 @@ class Field(nn.Module):
         """The transient field of the rays' photos, codes (R, TRANSIENT_CODE)."""
         assert self.transient is not None
         return transient_samples(self.transient(placed.inner, code[:, None]), placed.density, placed.deltas)
+
+
+def linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+    """x -> weight x + bias: weight (K, C), bias (K,)."""
+    outputs, inputs = weight.shape
+    layer = nn.Linear(inputs, outputs, device=weight.device, dtype=weight.dtype)
+    layer.weight = nn.Parameter(weight.detach().clone(), requires_grad=False)
+    layer.bias = nn.Parameter(bias.detach().clone(), requires_grad=False)
+    return layer
 
 
 def append_one(x: Tensor) -> Tensor:

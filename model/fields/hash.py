@@ -12,11 +12,13 @@ Notation: R rays, S samples a ray, edges e (R, S+1) with t at the middle of each
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import torch
 from torch import Tensor, nn
 
 from model.encoding import positional_encoding
-from model.fields.base import Field, Placed, Rays, at_least_float32, points
+from model.fields.base import Field, Placed, Rays, at_least_float32, linear, points
 from model.fields.hashgrid import HashEncoding
 from model.methods import CODE, HashSpec
 from model.sampling import sample_pdf
@@ -101,6 +103,26 @@ class HashField(Field):
         background = self.background(looked)
         return self.activate(at_least_float32(inner)), self.activate(at_least_float32(background))
 
+    def folded(self, A: Tensor, shift: Tensor) -> HashField:
+        """See Field. Features come out of linear layers, so A goes into these: the networks are narrower than before.
+
+        Where the trunk gives the features, its first output is the density, which stays.
+        """
+        if self.coded or self.rgb:
+            raise ValueError("a field that reads appearance codes, or gives colours, cannot be folded")
+        field = deepcopy(self).requires_grad_(False)
+        field.transient = None
+        if field.coloured is None:
+            last = field.trunk[-1]
+            assert isinstance(last, nn.Linear)
+            weight = torch.cat([last.weight[:1], A @ last.weight[1:]])
+            bias = torch.cat([last.bias[:1], A @ last.bias[1:] + shift])
+            field.trunk[-1] = linear(weight, bias)
+        else:
+            fold_last(field.coloured, A, shift)
+        fold_last(field.background, A, shift)
+        return field
+
     def freeze_proposal(self) -> None:
         """Without its loss the proposal stays as it is."""
         self.proposal.requires_grad_(False)
@@ -148,6 +170,13 @@ class HashField(Field):
 def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
     """One hidden layer, ReLU."""
     return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, outputs))
+
+
+def fold_last(network: nn.Sequential, A: Tensor, shift: Tensor) -> None:
+    """Let a network that gave f give A f + shift, by its last layer."""
+    last = network[-1]
+    assert isinstance(last, nn.Linear)
+    network[-1] = linear(A @ last.weight, A @ last.bias + shift)
 
 
 def uniform_edges(near: Tensor, far: Tensor, count: int, generator: torch.Generator | None) -> Tensor:

@@ -5,10 +5,12 @@ Codes enter the fine MLP only: the coarse one is unconditioned in the released c
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from copy import deepcopy
 
-from model.fields.base import Field, Level, Placed, Rays, at_least_float32, points
+import torch
+from torch import Tensor, nn
+
+from model.fields.base import Field, Level, Placed, Rays, at_least_float32, linear, points
 from model.fields.mlp import RadianceMLP
 from model.methods import CODE, MLPSpec
 from model.sampling import refine, stratified
@@ -36,7 +38,9 @@ class NeRFField(Field):
         }
         self.coarse = RadianceMLP(channels, **sizes)
         self.fine = RadianceMLP(channels, **sizes, code_channels=CODE if coded else 0)
+        self.coded = coded
         self.transient = TransientHead(spec.width, channels, bounded=True) if transient else None
+        self.fold: nn.Linear | None = None  # see `folded`
 
     def points_a_ray(self, samples: tuple[int, int] | None = None) -> int:
         """See Field: the fine MLP sees both kinds of samples."""
@@ -68,7 +72,19 @@ class NeRFField(Field):
     def seen(self, inner: Tensor, directions: Tensor, code: Tensor | None) -> tuple[Tensor, None]:
         """See Field. There is no background: light that meets nothing is lost."""
         code = None if code is None else code[:, None]
-        return at_least_float32(self.fine.features_at(inner, directions[:, None], code)), None
+        features = at_least_float32(self.fine.features_at(inner, directions[:, None], code))
+        return features if self.fold is None else self.fold(features), None
+
+    def folded(self, A: Tensor, shift: Tensor) -> NeRFField:
+        """See Field. Features come out of a sigmoid, so A is one more layer, applied at each point of the fine level;
+        it saves what compositing C channels would cost, and the coarse level stays as it is.
+        """
+        if self.coded:
+            raise ValueError("a field that reads appearance codes cannot be folded")
+        field = deepcopy(self).requires_grad_(False)
+        field.transient = None
+        field.fold = linear(A, shift)
+        return field
 
     def noisy(self, density: Tensor, generator: torch.Generator | None) -> Tensor:
         """Densities, in training with noise."""

@@ -217,7 +217,7 @@ def _draw_camera(rng: np.random.Generator, along: float, split: str, size: int) 
         if all(math.hypot(centre[0] - x, centre[1] - y) > r + 0.8 for x, y, r in OBSTACLES):
             break
     target = (rng.normal(0, 0.25), -0.5 + rng.normal(0, 0.15), 1.2 + rng.normal(0, 0.12))
-    rotation = _look(centre, target, math.radians(rng.normal(0, 1.0)))
+    rotation = look(centre, target, math.radians(rng.normal(0, 1.0)))
     focal = width / 2 / tangent
     if rng.random() < 0.5:
         return "SIMPLE_PINHOLE", Pinhole(width, height, focal, focal, width / 2, height / 2, rotation, centre)
@@ -226,7 +226,7 @@ def _draw_camera(rng: np.random.Generator, along: float, split: str, size: int) 
     return "PINHOLE", Pinhole(width, height, focal, fy, cx, cy, rotation, centre)
 
 
-def _look(centre: Sequence[float], target: Sequence[float], roll: float) -> tuple[tuple[float, float, float], ...]:
+def look(centre: Sequence[float], target: Sequence[float], roll: float) -> tuple[tuple[float, float, float], ...]:
     """Rows right, down, forward of a camera that looks at `target` and is held `roll` radians askew."""
     forward = np.subtract(target, centre)
     forward /= np.linalg.norm(forward)
@@ -278,7 +278,7 @@ def surface_points(seed: int) -> tuple[np.ndarray, np.ndarray]:
         # Every other place lies behind and above the photographers: there are points at their feet, too.
         distance, height, aim = ((4.6, 0.8, 0.95), (7.2, 2.6, -2.2))[k % 2]
         eye = (distance * math.sin(angle), -0.6 - distance * math.cos(angle), height)
-        camera = Pinhole(96, 72, 56.0, 56.0, 48.0, 36.0, _look(eye, (0.0, -0.5, aim), 0.0), eye)
+        camera = Pinhole(96, 72, 56.0, 56.0, 48.0, 36.0, look(eye, (0.0, -0.5, aim), 0.0), eye)
         hits = trace_grid(camera, solids(), 1)
         seen = rng.permutation(np.flatnonzero(hits.which >= 0))
         points, _, albedo = surfaces(hits, seen, list(solids()))

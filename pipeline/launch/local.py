@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import uuid
+from collections.abc import Callable
 from typing import Any
 
 from pipeline.config import Job, save_job
@@ -40,16 +41,35 @@ def run_ranks(job: Job) -> dict[str, Any]:
     """Several ranks as processes; if one fails, all are ended."""
     from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
-    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     open_photos(job.shards)  # damaged shards are found once, here, and not by every rank
+    job_file = job.run / "job.yaml"
+    save_job(job, job_file)
+    before = written(job)
+    try:
+        return start_ranks(job, run_rank_of, str(job_file))[0]
+    except SignalException:
+        return stopped(job, before)
+    except ChildFailedError as error:
+        rank, failure = error.get_first_failure()
+        if failure.exitcode == STOPPED:  # somebody has asked one of the ranks, and not this process
+            return stopped(job, before)
+        raise CrossrayError(f"training stopped: rank {rank} failed: {first_line(failure.message)}") from None
+
+
+def start_ranks(job: Job, entry: Callable[..., Any], *arguments: Any) -> dict[int, Any]:
+    """Call `entry` in a process each of the job's ranks, with torchrun's variables set; what it returns, by rank.
+
+    Raises:
+        ChildFailedError, SignalException: torch's, when a rank failed or this process was told to stop.
+    """
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)  # what went wrong is raised below
     # A rank waiting for another one must not spin on the core that the other needs.
     for name, value in (("OMP_NUM_THREADS", str(job.threads)), ("OMP_WAIT_POLICY", "PASSIVE")):
         os.environ.setdefault(name, value)
     os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
-    job_file = job.run / "job.yaml"
-    save_job(job, job_file)
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,
@@ -63,16 +83,7 @@ def run_ranks(job: Job) -> dict[str, Any]:
         start_method="spawn",
         shutdown_timeout=GRACE,
     )
-    before = written(job)
-    try:
-        return elastic_launch(config, run_rank_of)(str(job_file))[0]
-    except SignalException:
-        return stopped(job, before)
-    except ChildFailedError as error:
-        rank, failure = error.get_first_failure()
-        if failure.exitcode == STOPPED:  # somebody has asked one of the ranks, and not this process
-            return stopped(job, before)
-        raise CrossrayError(f"training stopped: rank {rank} failed: {first_line(failure.message)}") from None
+    return elastic_launch(config, entry)(*arguments)
 
 
 def written(job: Job) -> int | None:

@@ -28,7 +28,8 @@ from pipeline.launch.torchrun import pick_device
 from pipeline.protocol import check_protocols
 from pipeline.provenance import provenance
 from pipeline.resume import checkpoints
-from pipeline.study import Run, StudyJob, Table, expand, make_tables, result_of, write_results
+from pipeline.study import Run, StudyJob, expand, result_of
+from pipeline.study_tables import Table, make_tables, write_results
 
 log = logging.getLogger("crossray")
 

@@ -31,6 +31,7 @@ from pipeline.errors import CrossrayError
 from pipeline.launch.home import HOME
 from pipeline.reeval import load_reeval
 from pipeline.study import load_study, read_kind
+from pipeline.timing_job import load_timing, methods_of
 
 HERE = "http://127.0.0.1:8265"  # where `ray start --head` listens
 PACKAGES = ("model", "pipeline")
@@ -111,6 +112,9 @@ def describe(file: Path, settings: Sequence[str]) -> dict[str, str]:
         return about | {"name": study.name, "scene": " ".join(study.scenes), "method": " ".join(study.variants)}
     if kind == "reeval":
         return about | {"name": " ".join(load_reeval(file, settings).runs)}
+    if kind == "timing":
+        timing = load_timing(file, settings)
+        return about | {"name": timing.name, "method": " ".join(methods_of(timing))}
     job = load_job(file, settings)
     return about | {"name": job.name, "scene": job.scene.path.name, "method": job.method}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +44,8 @@ def pick_device(job: Job, local_rank: int) -> torch.device:
     return torch.device("cuda", local_rank)
 
 
-def run_rank(job: Job) -> dict[str, Any]:
-    """Train as the rank that RANK, WORLD_SIZE and LOCAL_RANK say.
+def run_rank(job: Job, stage: Callable[[Job, Context], Any] = train) -> Any:
+    """Train, or do what `stage` does, as the rank that RANK, WORLD_SIZE and LOCAL_RANK say.
 
     Raises:
         CrossrayError: the variables are missing, WORLD_SIZE is not the job's `ranks`, or restarts would not work.
@@ -65,7 +66,7 @@ def run_rank(job: Job) -> dict[str, Any]:
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        result = train(job, Context(rank, world, device, RankStop().install()))
+        result = stage(job, Context(rank, world, device, RankStop().install()))
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)  # nobody asks a rank that has returned whether it was told to stop

@@ -118,6 +118,17 @@ def every_choice() -> list[ModelSpec]:
     return found
 
 
+@pytest.mark.parametrize("row", METHODS)
+def test_only_a_transform_takes_statistics(row):
+    spec = dataclasses.replace(small_spec(row), statistics="running")
+    if spec.appearance == "crossray":
+        check_spec(spec)
+        return
+    with pytest.raises(ValueError, match=r"model.statistics: running needs model.appearance: crossray"):
+        check_spec(spec)
+    check_spec(dataclasses.replace(spec, statistics="view"))
+
+
 def test_every_accepted_choice_takes_a_step_and_renders():
     """No part may assume a neighbour: all combinations, not only the rows."""
     specs = every_choice()

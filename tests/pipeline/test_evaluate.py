@@ -1,9 +1,11 @@
-"""Protocols: what they are called, what they read, and that the scores are those of the pictures that are written."""
+"""Evaluations: what a protocol lets a model see, and that the scores are those of the pictures that are written."""
 
 from __future__ import annotations
 
 import json
+import math
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +14,13 @@ import torch
 from PIL import Image
 from tiny_run import cut_tiny, tiny_job
 
+from model.methods import METHODS, HashSpec, ModelSpec
+from model.scene_model import SceneModel
 from pipeline import evaluate as module
 from pipeline import judge
+from pipeline.bootstrap import interval
 from pipeline.checkpoint import CheckpointError
+from pipeline.cli import print_scores
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import (
     CheckpointGone,
@@ -25,15 +31,20 @@ from pipeline.evaluate import (
     recorded,
     run_protocols,
     score_views,
+    update_best,
 )
 from pipeline.fit import FitRecipe, fit_code
-from pipeline.judge import Judge, fit_colours
+from pipeline.judge import Judge, fit_colours, score
 from pipeline.launch.run import claim_run
+from pipeline.launch.tasks import in_process
+from pipeline.lpips import find_lpips
 from pipeline.metrics import ssim_11, ssim_window3
 from pipeline.photos import open_photos
 from pipeline.protocol import parse_protocol
+from pipeline.reeval import ReevalJob, one_pass
 from pipeline.render import render_picture
 from pipeline.runs import checkpoint_of, job_of, load_run
+from pipeline.status import last_evaluation
 from pipeline.train import train
 from pipeline.work import Context
 
@@ -78,54 +89,6 @@ def photos(trained):
     return open_photos(tiny_job(trained).shards)
 
 
-# Names
-
-
-@pytest.mark.parametrize(
-    ("name", "appearance", "ssim", "downscale", "affine"),
-    [
-        ("crnerf-full@R4", "whole", "window3", 4, False),
-        ("crnerf-full@R2", "whole", "window3", 2, False),
-        ("nerfw-half@R1", "left", "window11", 1, False),
-        ("nerfw-half@R16+affine", "left", "window11", 16, True),
-    ],
-)
-def test_a_protocol_is_named_with_its_downscale(name, appearance, ssim, downscale, affine):
-    protocol, found_downscale, found_affine = parse_protocol(name)
-    assert (found_downscale, found_affine) == (downscale, affine)
-    assert (protocol.appearance, protocol.ssim) == (appearance, ssim)
-    assert (protocol.scored, protocol.rounding, protocol.mlp_samples) == ("right", "truncate", (256, 256))
-
-
-def test_cross_scores_whole_clean_pictures():
-    protocol, downscale, affine = parse_protocol("cross@R1")
-    assert (downscale, affine) == (1, False)
-    assert (protocol.appearance, protocol.scored, protocol.truth) == ("elsewhere", "whole", "clean")
-    assert (protocol.ssim, protocol.rounding, protocol.mlp_samples) == ("window11", "round", (256, 256))
-
-
-def test_all_protocols_fit_codes_by_one_recipe():
-    """Codes are shared between protocols: for one photo and half there is one fit."""
-    first, *others = (parse_protocol(name)[0].fit for name in ("crnerf-full@R4", "nerfw-half@R1", "cross@R1"))
-    assert all(fit == first for fit in others)
-    assert first["mlp"] == FitRecipe(steps=1000, rays=1024, learning_rate=0.01)  # nerfbaselines' of NeRF-W
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["crnerf-full", "crnerf-full@", "crnerf-full@4", "crnerf-full@R0", "crnerf-full@R04", "crnerf-full@R4+afine", "",
-     "@R4", "crnerf-full@R4 ", "crnerf-full@R4\n", "CRNERF-FULL@R4", "../protocols/crnerf-full@R4"],
-)  # fmt: skip
-def test_a_bare_or_misspelt_name_says_how_to_write_it(name):
-    with pytest.raises(CrossrayError, match=r"crnerf-full@R4.*known: crnerf-full, cross, nerfw-half"):
-        parse_protocol(name)
-
-
-def test_an_unknown_protocol_names_the_known_ones():
-    with pytest.raises(CrossrayError, match=r"'crnerf-ful' is not known \(known: crnerf-full, cross, nerfw-half\)"):
-        parse_protocol("crnerf-ful@R4")
-
-
 # Scores
 
 
@@ -166,8 +129,125 @@ def test_metrics_say_what_was_evaluated_and_how(run):
     meta = json.loads((folder / "checkpoints" / STEP / "meta.json").read_text())
     assert result["checkpoint_sha256"] == meta["sha256"]["model.safetensors"]
     assert (result["protocol"], result["step"], result["method"]) == ("crnerf-full@R2", 6, "crossray")
-    assert result["definition"]["appearance"] == "whole"
-    assert {"torch", "numpy"} <= result["versions"].keys()
+    assert result["definition"] == parse_protocol("crnerf-full@R2")[0].model_dump(mode="json")
+    assert result["statistics"] == job_of(folder).model.statistics
+    assert result["versions"] == result["provenance"]["versions"]
+    assert result["provenance"].keys() == {"command", "commit", "date", "hardware", "versions", "python"}
+    assert result["interval"] == {"psnr": None, "ssim": None}  # one photo
+
+
+def test_intervals_are_those_of_the_photos(several, monkeypatch):
+    monkeypatch.setenv("CROSSRAY_CACHE", str(several / "cache"))
+    result = evaluate_run(several / "runs" / "crossray", "crnerf-full@R2")
+    for metric in ("psnr", "ssim"):
+        values = [row[metric] for row in result["images"]]
+        assert tuple(result["interval"][metric]) == interval(values)
+        assert min(values) <= result["interval"][metric][0] < result["mean"][metric] < result["interval"][metric][1]
+
+
+def test_means_are_printed_with_their_intervals(capsys):
+    result = {"protocol": "cross@R1", "step": 6, "images": [{}, {}], "mean": {"psnr": 23.119, "mask_iou": 0.5}}
+    print_scores(result | {"interval": {"psnr": [21.909, 24.21], "mask_iou": None}})
+    assert capsys.readouterr().out == "cross@R1 (step 6, 2 photos): PSNR 23.12 [21.91, 24.21]  MASK_IOU 0.5\n"
+    print_scores(result)  # as it was recorded before there were intervals
+    assert capsys.readouterr().out == "cross@R1 (step 6, 2 photos): PSNR 23.12  MASK_IOU 0.5\n"
+
+
+class FakeTime:
+    """A clock that only rendering, reading and fitting move."""
+
+    def __init__(self):
+        self.seconds = 0.0
+
+    def perf_counter(self):
+        return self.seconds
+
+    def taking(self, seconds, function):
+        def timed(*args, **kwargs):
+            self.seconds += seconds
+            return function(*args, **kwargs)
+
+        return timed
+
+
+def test_each_protocol_has_its_own_times_whoever_did_the_work(run, monkeypatch):
+    """A view is rendered once for all of them, and each says what it took."""
+    clock = FakeTime()
+    monkeypatch.setattr(judge, "time", clock)
+    for name, seconds in (("render_view", 5.0), ("read_appearance", 2.0), ("fit_map", 30.0), ("fit_colours", 0.5)):
+        monkeypatch.setattr(judge, name, clock.taking(seconds, getattr(judge, name)))
+    names = ["crnerf-full@R2", "nerfw-half@R2", "nerfw-half@R2+fit", "nerfw-half@R2+affine"]
+    results = evaluate_protocols(run(), names)
+    assert [r["appearance_seconds"] for r in results] == [2.0, 2.0, 32.0, 2.5]
+    assert [r["render_seconds"] for r in results] == [5.0] * 4
+
+
+def test_fitting_learned_codes_has_its_own_time(run, quick, monkeypatch):
+    clock = FakeTime()
+    monkeypatch.setattr(judge, "time", clock)
+    for name, seconds in (("render_view", 5.0), ("fit_code", 40.0)):
+        monkeypatch.setattr(judge, name, clock.taking(seconds, getattr(judge, name)))
+    results = evaluate_protocols(run("nerfw"), ["crnerf-full@R2", "nerfw-half@R2"])  # one fit
+    assert [r["appearance_seconds"] for r in results] == [40.0, 40.0]
+    assert [r["render_seconds"] for r in results] == [5.0, 5.0]
+    assert results[0]["statistics"] == "none"
+
+
+def test_without_an_appearance_none_takes_time(trained, photos, monkeypatch):
+    clock = FakeTime()
+    monkeypatch.setattr(judge, "time", clock)
+    monkeypatch.setattr(judge, "render_view", clock.taking(5.0, judge.render_view))
+    quick = parse_protocol("crnerf-full@R2")[0].model_copy(update={"mlp_samples": (4, 4)})
+    judged = Judge(load_run(trained / "runs" / "nerf")[1], photos, quick, None).render(3)
+    assert (judged.appearance_seconds, judged.render_seconds) == (0.0, 5.0)
+
+
+def test_an_evaluation_of_before_is_read_where_it_can_be_and_made_again(run, capsys):
+    """One without the keys that came later, under a definition with fewer keys."""
+    folder = run()
+    whole = evaluate_run(folder, "crnerf-full@R2")
+    path = folder / "eval" / "crnerf-full@R2" / STEP / "metrics.json"
+    later = ("interval", "statistics", "appearance_seconds", "render_seconds", "provenance")
+    old = {key: value for key, value in whole.items() if key not in later}
+    path.write_text(json.dumps(old))
+    assert recorded(folder, "crnerf-full@R2", checkpoint_of(folder)) == old  # what was scored is the same
+    job = job_of(folder)
+    job = job.model_copy(update={"evaluate": job.evaluate.model_copy(update={"protocols": ("crnerf-full@R2",)})})
+    print_scores(run_protocols(job)[0])
+    assert "PSNR" in capsys.readouterr().out
+
+    old["definition"] = {
+        k: v for k, v in old["definition"].items() if k not in ("resize", "lpips", "fit_read", "suffix")
+    }
+    path.write_text(json.dumps(old))
+    assert recorded(folder, "crnerf-full@R2", checkpoint_of(folder)) is None
+    assert last_evaluation(folder) == f"crnerf-full@R2 at 6: {whole['mean']['psnr']:.2f} dB"
+    update_best(folder, "crnerf-full@R2")
+    assert not (folder / "eval" / "crnerf-full@R2" / "best.json").exists()
+    summary = one_pass(ReevalJob(runs=(str(folder),), protocols=("crnerf-full@R2",)), in_process)
+    assert (summary.evaluated, summary.skipped, summary.failed) == (2, [], [])  # of both checkpoints
+    assert json.loads(path.read_text())["images"] == whole["images"]
+    assert json.loads((folder / "eval" / "crnerf-full@R2" / "best.json").read_text())["of"] == 2
+
+
+@pytest.mark.parametrize("infinite", [1, 3])
+def test_perfect_pictures_are_recorded_and_read_again(several, tmp_path, monkeypatch, capsys, infinite):
+    """PSNR inf: the mean is inf, no interval, and nobody who reads it stumbles."""
+    monkeypatch.setenv("CROSSRAY_CACHE", str(several / "cache"))
+    folder = shutil.copytree(several / "runs" / "crossray", tmp_path / "runs" / "crossray")
+    shutil.rmtree(folder / "eval", ignore_errors=True)
+    real, perfect = judge.score, [f"photo_{i:03d}.jpg" for i in (1, 3, 5)][:infinite]
+    monkeypatch.setattr(judge, "score", lambda p, t, *w: real(t if w[-1] in perfect else p, t, *w))
+    result = evaluate_run(folder, "crnerf-full@R2")
+    assert [row["psnr"] for row in result["images"]].count(math.inf) == infinite
+    assert result["mean"]["psnr"] == math.inf
+    assert result["interval"]["psnr"] is None
+    assert result["interval"]["ssim"] is not None
+    assert recorded(folder, "crnerf-full@R2", checkpoint_of(folder)) == result
+    assert json.loads((folder / "eval" / "crnerf-full@R2" / "best.json").read_text())["psnr"] == math.inf
+    assert last_evaluation(folder) == "crnerf-full@R2 at 2: inf dB"
+    print_scores(result)
+    assert "PSNR inf  SSIM" in capsys.readouterr().out
 
 
 def test_an_older_step_may_be_asked_for(run):
@@ -239,6 +319,15 @@ def several(tmp_path_factory):
     return folder
 
 
+def metrics_of(part, name):
+    return {index: row.metrics for index, row in part.rows[name].items()}
+
+
+def without_times(results):
+    times = ("seconds", "appearance_seconds", "render_seconds", "provenance")
+    return [{k: v for k, v in result.items() if k not in times} for result in results]
+
+
 @pytest.mark.parametrize("method", ["crossray", "nerfw"])
 def test_the_numbers_are_the_same_however_views_are_split(several, quick, method, monkeypatch):
     monkeypatch.setenv("CROSSRAY_CACHE", str(several / "cache"))
@@ -250,11 +339,10 @@ def test_the_numbers_are_the_same_however_views_are_split(several, quick, method
     at_once = score_views(split[0]._replace(photos=(1, 3, 5)))
     parts = [score_views(task) for task in reversed(split)]
     for name in names:
-        assert at_once.rows[name] == {index: row for part in parts for index, row in part.rows[name].items()}
+        assert metrics_of(at_once, name) == {k: v for part in parts for k, v in metrics_of(part, name).items()}
         alone = score_views(split[1]._replace(protocols=(name,)))
-        assert alone.rows[name][3] == at_once.rows[name][3]  # nor do other protocols change a number
-    results = [{k: v for k, v in r.items() if k != "seconds"} for r in evaluation.commit(parts)]
-    again = [{k: v for k, v in r.items() if k != "seconds"} for r in evaluation.commit([at_once])]
+        assert metrics_of(alone, name)[3] == metrics_of(at_once, name)[3]  # nor do other protocols change a number
+    results, again = (without_times(evaluation.commit(p)) for p in (parts, [at_once]))
     assert results == again
     assert [row["name"] for row in results[0]["images"]] == ["photo_001.jpg", "photo_003.jpg", "photo_005.jpg"]
 
@@ -371,7 +459,7 @@ def responsive(trained):
 
 
 def predict(model, photos, index, name):
-    return Judge(model, photos, parse_protocol(name)[0], None).render(index)[1]
+    return Judge(model, photos, parse_protocol(name)[0], None).render(index).picture
 
 
 def test_the_left_half_protocol_does_not_see_the_right_half(responsive, photos):
@@ -406,9 +494,9 @@ def quick(monkeypatch):
     calls = []
 
     def parse(name):
-        protocol, downscale, affine = parse_protocol(name)
+        protocol, downscale = parse_protocol(name)
         quick = {"mlp": FitRecipe(steps=7, rays=64), "hash": FitRecipe(steps=5, rays=64)}
-        return protocol.model_copy(update={"fit": quick}), downscale, affine
+        return protocol.model_copy(update={"fit": quick}), downscale
 
     def spy(model, image, camera, columns, recipe, **kwargs):
         assert recipe.steps == 5  # that of the model's field
@@ -472,7 +560,7 @@ def test_a_fitted_code_knows_nothing_of_the_right_half(trained, photos, quick, n
     (index,) = photos.indices("test")
     protocol = module.parse_protocol(name)[0]
     code, same, other = (
-        Judge(model, p, protocol, None).appearance(index)
+        Judge(model, p, protocol, None).appearance(index)[0]
         for p in (photos, DoctoredImage(photos, index, 25), DoctoredImage(photos, index, 23))
     )
     assert torch.equal(code, same)
@@ -498,6 +586,167 @@ def test_a_fitted_picture_is_what_is_scored(run, photos, quick):
     prediction, truth = by_hand(folder / "eval" / "crnerf-full@R2" / STEP, photos, index, 49 // 2)
     np.testing.assert_array_equal(prediction, (255 * picture).astype(np.uint8)[:, 49 // 2 :])
     assert row["psnr"] == pytest.approx(-10 * np.log10(np.square(prediction / 255 - truth / 255).mean()), abs=1e-9)
+
+
+# Test-time fitting of what is read from a photo
+
+
+def test_fit_starts_from_the_encoder_and_comes_closer_to_the_left_half(responsive, photos):
+    (index,) = photos.indices("test")
+    left, photo = slice(25), photos.image(index) / 255
+    plain, fitted = (predict(responsive, photos, index, n) for n in ("nerfw-half@R2", "nerfw-half@R2+fit"))
+    before, after = (np.square(p[:, left] - photo[:, left]).mean() for p in (plain, fitted))
+    assert after < 0.99 * before
+    of = Judge(responsive, photos, parse_protocol("nerfw-half@R2")[0], None)
+    further = Judge(responsive, photos, parse_protocol("nerfw-half@R2+fit")[0], None)
+    start, end = of.appearance(index)[0], further.appearance(index, further.view(index)[0])[0]
+    recipe = further.protocol.fit_read["hash"]
+    assert 0 < (end - start).abs().max() < 1.5 * recipe.steps * recipe.learning_rate  # a step is about the rate
+
+
+@pytest.mark.parametrize("name", ["nerfw-half@R2+fit", "crnerf-full@R2+fit"])
+def test_fit_knows_nothing_of_the_right_half_but_what_the_encoder_reads(responsive, photos, name):
+    """Also under the protocol whose encoder reads the whole photo. Of 49 columns the middle one counts as left."""
+
+    class SameReference(DoctoredImage):
+        def reference(self, i):
+            return self.photos.reference(i)
+
+    (index,) = photos.indices("test")
+    picture, same, other = (
+        predict(responsive, p, index, name)
+        for p in (photos, SameReference(photos, index, 25), SameReference(photos, index, 23))
+    )
+    np.testing.assert_array_equal(picture, same)
+    assert np.abs(picture - other).max() > 1e-4
+
+
+def test_fit_of_the_left_half_sees_nothing_of_the_right_one_at_all(responsive, photos):
+    class Negative(DoctoredImage):
+        def reference(self, i):
+            reference = self.photos.reference(i).copy()
+            reference[:, reference.shape[1] - reference.shape[1] // 2 :] = 0
+            return reference
+
+    (index,) = photos.indices("test")
+    picture, same = (predict(responsive, p, index, "nerfw-half@R2+fit") for p in (photos, Negative(photos, index, 25)))
+    np.testing.assert_array_equal(picture, same)
+
+
+def test_fit_of_a_code_that_is_read_starts_from_it(photos, monkeypatch):
+    spec = ModelSpec(
+        **METHODS["hanerf"].axes() | {"field": "hash", "transient": "none"},
+        encoder="compact",
+        hash=HashSpec(**tiny_run.HASH),
+    )
+    torch.manual_seed(0)
+    model = SceneModel(spec, torch.tensor([[-1.0, -1, -1], [1, 1, 1]])).eval().requires_grad_(False)
+    calls = []
+    monkeypatch.setattr(judge, "fit_code", lambda *a, **k: calls.append((a, k)) or k["start"] + 1)
+    (index,) = photos.indices("test")
+    read = Judge(model, photos, parse_protocol("nerfw-half@R2")[0], None).appearance(index)[0]
+    assert calls == []
+    fitted = Judge(model, photos, parse_protocol("nerfw-half@R2+fit")[0], None)
+    torch.testing.assert_close(fitted.appearance(index)[0], read + 1)
+    (((_, image, camera, columns, recipe), words),) = calls
+    np.testing.assert_array_equal(image, photos.image(index))
+    assert (camera, columns) == (photos.records[index], 25)
+    assert recipe == fitted.protocol.fit_read["hash"]
+    torch.testing.assert_close(words["start"], read)
+
+
+def test_fit_is_recorded_as_what_it_is_and_refused_where_it_is_nothing(run):
+    folder = run()
+    plain, fitted = evaluate_protocols(folder, ["nerfw-half@R2", "nerfw-half@R2+fit"])
+    assert (plain["definition"]["suffix"], fitted["definition"]["suffix"]) == (None, "fit")
+    assert plain["definition"] | {"suffix": "fit"} == fitted["definition"]
+    assert fitted["appearance_from"] == "left"
+    assert (folder / "eval" / "nerfw-half@R2+fit" / STEP / "metrics.json").is_file()
+    for method, reason in (("nerf", "no appearance to fit"), ("nerfw", "always fitted")):
+        with pytest.raises(CrossrayError, match=reason):
+            evaluate_run(run(method), "nerfw-half@R2+fit")
+
+
+# What no picture can be scored of
+
+
+def spoilt(march):
+    """With one feature that is no number."""
+    level = march.levels[-1]
+    level.features[0, 0, 0] = math.nan
+    return march
+
+
+@pytest.mark.parametrize(
+    ("part", "what"),
+    [
+        ("field", "its rendered view"),
+        ("encoder", "the appearance that is read"),
+        ("transform", "its picture"),
+        ("decoder", "its picture"),
+    ],
+)
+@pytest.mark.parametrize("name", ["crnerf-full@R2", "crnerf-full@R2+affine", "nerfw-half@R2+fit"])
+def test_a_model_that_gives_nan_is_refused_with_the_photo(trained, photos, part, what, name, monkeypatch):
+    _, model, _ = load_run(trained / "runs" / "crossray")
+    if part == "field":  # of finite weights: what they give may overflow
+        level = model.field.look
+        monkeypatch.setattr(model.field, "look", lambda *a, **k: spoilt(level(*a, **k)))
+    else:
+        for parameter in getattr(model, part).parameters():
+            parameter.fill_(math.nan)
+    (index,) = photos.indices("test")
+    if name.endswith("+fit") and what == "its picture":
+        what = "the appearance that is fitted"
+    with pytest.raises(CrossrayError, match=rf"photo_003\.jpg: \d+ of \d+ numbers of {what}.* are NaN.*--step"):
+        Judge(model, photos, parse_protocol(name)[0], None).render(index)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize(("method", "part"), [("crossray", "field"), ("nerf", "field"), ("nerfw", "embedding")])
+def test_weights_that_are_no_numbers_are_named_before_anything_is_rendered(run, method, part, value, monkeypatch):
+    folder, model_of = run(method), module.model_of
+
+    def broken(*words):
+        model = model_of(*words)
+        list(getattr(model, part).parameters())[-1].view(-1)[-1] = value
+        return model
+
+    monkeypatch.setattr(module, "model_of", broken)
+    module._latest.clear()
+    with pytest.raises(CrossrayError, match=rf"step-00000006: {part}\..* not finite.*--step"):
+        evaluate_run(folder, "nerfw-half@R2")
+    assert not [*folder.rglob("metrics.json"), *folder.rglob("*.png")]
+    assert not module._latest
+
+
+@pytest.mark.parametrize(("name", "window"), [("crnerf-full@R1", 3), ("nerfw-half@R1", 11)])
+@pytest.mark.parametrize("size", [(1, 1), (40, 3), (2, 40), (1, 40)])
+def test_a_photo_too_small_for_ssim_is_named(name, window, size):
+    picture = np.zeros((*size, 3), np.uint8)
+    scored = size[1] - size[1] // 2
+    with pytest.raises(CrossrayError, match=rf"x\.jpg: its scored part is {scored} x {size[0]} .* window of {window}"):
+        score(picture, picture, parse_protocol(name)[0], None, "x.jpg")
+
+
+@pytest.mark.parametrize("width", [40, 41])
+def test_the_middle_column_of_an_odd_width_is_read_and_scored(width):
+    picture = np.zeros((12, width, 3), np.uint8)
+    assert judge.left_half(picture).shape[1] == (20 if width == 40 else 21)
+    truth = picture.copy()
+    truth[:, width // 2 - 1] = 9  # the last column that is not scored
+    protocol = parse_protocol("nerfw-half@R1")[0]
+    assert score(picture, truth, protocol, None, "x")["psnr"] == math.inf
+    truth[:, width // 2] = 9
+    expected = -10 * math.log10((9 / 255) ** 2 / (width - width // 2))
+    assert score(picture, truth, protocol, None, "x")["psnr"] == pytest.approx(expected)
+
+
+def test_pictures_of_other_sizes_are_never_scored():
+    with pytest.raises(ValueError, match="differ in shape"):
+        score(
+            np.zeros((20, 40, 3), np.uint8), np.zeros((20, 41, 3), np.uint8), parse_protocol("cross@R1")[0], None, "x"
+        )
 
 
 # The affine control
@@ -569,10 +818,36 @@ def test_lpips_is_left_out_with_one_warning_where_there_are_no_weights(run, said
     assert "CROSSRAY_LPIPS" in said[0]
 
 
+@pytest.mark.parametrize(("width", "usable"), [(62, True), (61, True), (60, False), (1, False)])
+def test_lpips_takes_what_is_scored_of_an_odd_width(photos, monkeypatch, said, width, usable):
+    """Of 61 columns 31 are scored, which is enough."""
+    monkeypatch.setattr(judge, "find_lpips", lambda: object())
+    (index,) = photos.indices("test")
+    record = photos.records[index].model_copy(update={"width": width, "height": 40})
+    one = SimpleNamespace(records={index: record})
+    assert judge.lpips_usable(one, (index,), parse_protocol("nerfw-half@R1")[0]) is usable
+    assert len(said) == (0 if usable else 1)
+
+
+@pytest.mark.parametrize("damage", ["absent", "damaged", "of another network"])
+def test_weights_that_are_named_and_cannot_be_used_end_the_evaluation(run, tmp_path, monkeypatch, damage):
+    """Before anything is rendered: a column that was asked for is not left out quietly."""
+    path = tmp_path / "weights.npz"
+    if damage == "damaged":
+        path.write_bytes(b"PK\x03\x04 no weights")
+    elif damage == "of another network":
+        np.savez(path, **{"features.0.weight": np.zeros((64, 3, 3, 3), np.float32)})
+    monkeypatch.setenv("CROSSRAY_LPIPS", str(path))
+    monkeypatch.setattr(judge, "find_lpips", find_lpips)
+    monkeypatch.setattr(module, "score_views", None)
+    folder = run()
+    with pytest.raises(CrossrayError, match=r"weights\.npz"):
+        evaluate_run(folder, "crnerf-full@R2")
+    assert not list(folder.rglob("*.png"))
+
+
 @pytest.mark.real
 def test_lpips_is_scored_with_the_real_weights(trained, test_data, tmp_path, monkeypatch):
-    from pipeline.lpips import find_lpips
-
     weights = test_data / "lpips" / "lpips_alex.npz"
     monkeypatch.setattr(judge, "find_lpips", lambda: find_lpips(weights))
     folder = cut_tiny(tmp_path, size=(140, 80))
@@ -593,8 +868,6 @@ def test_lpips_is_scored_with_the_real_weights(trained, test_data, tmp_path, mon
 @pytest.mark.real
 def test_lpips_is_left_out_where_pictures_are_too_small(run, test_data, monkeypatch, said):
     """The scored half of the tiny photo is 25 pixels wide; AlexNet needs 31."""
-    from pipeline.lpips import find_lpips
-
     monkeypatch.setattr(judge, "find_lpips", lambda: find_lpips(test_data / "lpips" / "lpips_alex.npz"))
     assert "lpips" not in evaluate_run(run(), "crnerf-full@R2")["mean"]
     assert "photo_003.jpg" in said[0]

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from model.methods import CODE, METHODS, TRANSIENT_CODE, HashSpec, MLPSpec, ModelSpec
 from model.scene_model import SceneModel
-from pipeline import fit as module
 from pipeline.fit import FitRecipe, fit_code, rays_through
 from pipeline.render import render_picture, view_rays
 from pipeline.shards import CameraRecord
@@ -230,13 +229,12 @@ def test_the_learning_rate_falls_to_a_tenth_twice(monkeypatch):
 
 def test_samples_are_placed_once_for_a_pool_of_pixels(monkeypatch):
     """More pixels than the pool holds: some are left out, the light is found nevertheless."""
-    monkeypatch.setattr(module, "POOL", 50)
     model = model_of("embedding-alone")
     photo = photo_of(model)
     place, placed = model.field.place, []
     with monkeypatch.context() as patch:
         patch.setattr(model.field, "place", lambda rays: placed.append(len(rays.near)) or place(rays))
-        found = fit_code(model, photo, CAMERA, LEFT, RECIPE)
+        found = fit_code(model, photo, CAMERA, LEFT, RECIPE.model_copy(update={"pool": 50}))
     assert placed == [50]
     truth, mean = clean(model, codes_of_a_photo()[0]), model.embedding.weight.detach().mean(0, keepdim=True)
     left_out = slice(LEFT, None)
@@ -254,6 +252,8 @@ def test_rays_through_pixels_are_those_of_the_view(pixel_center):
 
 @pytest.mark.parametrize("method", [m for m, axes in METHODS.items() if axes.appearance != "embedding"])
 def test_a_model_without_learned_codes_has_none_to_fit(method):
+    appearance = METHODS[method].appearance
     model = SceneModel(ModelSpec(**METHODS[method].axes(), mlp=SPECS["nerfw"].mlp), torch.zeros(2, 3))
-    with pytest.raises(ValueError, match=rf"model\.appearance: {METHODS[method].appearance} has no code to fit"):
+    lacking = "no learned codes to start" if appearance == "code" else "no code to fit"
+    with pytest.raises(ValueError, match=rf"model\.appearance: {appearance} has {lacking}"):
         fit_code(model, np.zeros((16, WIDTH, 3), np.uint8), CAMERA, LEFT, FitRecipe(steps=1))

@@ -152,6 +152,56 @@ def test_pictures_that_do_not_fit_are_refused(weights):
     assert lpips.distance(picture(0)[:31, :31], picture(1)[:31, :31]) > 0
 
 
+@pytest.mark.parametrize("size", [(31, 31), (33, 47), (64, 31), (40, 33)])
+def test_odd_and_least_sizes_have_a_distance(weights, size):
+    distance = LPIPS(weights, "test").distance(picture(0, size), picture(1, size))
+    assert np.isfinite(distance)
+    assert distance > 0
+
+
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_constant_pictures_have_a_distance(weights, value):
+    lpips, flat = LPIPS(weights, "test"), np.full((40, 33, 3), value, np.uint8)
+    assert lpips.distance(flat, flat) == 0.0
+    assert 0 < lpips.distance(flat, picture(0)) < np.inf
+
+
+def test_one_pixel_and_none_are_refused(weights):
+    lpips = LPIPS(weights, "test")
+    for size in ((1, 1), (0, 0), (30, 100), (100, 30)):
+        with pytest.raises(ValueError, match="31"):
+            lpips.distance(picture(0, size), picture(0, size))
+
+
+def test_a_named_file_that_is_absent_is_never_left_out_quietly(tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "gone.npz"))
+    with pytest.raises(CrossrayError, match=rf"gone\.npz.*unset {VARIABLE}"):
+        find_lpips()
+
+
+@pytest.mark.parametrize("suffix", ["npz", "compressed.npz", "safetensors"])
+def test_a_damaged_file_is_refused_wherever_it_is_damaged(weights, tmp_path, suffix):
+    """Cut anywhere, or with bytes changed in its tables: one clear error, or it reads as if nothing had happened."""
+    small = {name: value[:1, :1].contiguous() for name, value in weights.items() if value.ndim > 1}
+    path = tmp_path / f"weights.{suffix}"
+    if suffix == "safetensors":
+        save_file(small, path)
+    else:
+        save = np.savez_compressed if suffix.startswith("compressed") else np.savez
+        save(path, **{name: value.numpy() for name, value in small.items()})
+    whole, generator = path.read_bytes(), np.random.default_rng(0)
+    damaged = [whole[:cut] for cut in np.linspace(0, len(whole) - 1, 40, dtype=int)]
+    for _ in range(100):
+        content = bytearray(whole)
+        content[generator.integers(len(content))] = generator.integers(256)
+        damaged.append(bytes(content))
+    for content in damaged:
+        path.write_bytes(content)
+        with pytest.raises(CrossrayError) as caught:  # it lacks most weights, so whole files are refused as well
+            find_lpips(path)
+        assert str(path) in str(caught.value)
+
+
 @pytest.mark.real
 def test_golden_lpips(test_data):
     folder = test_data / "lpips"

@@ -30,6 +30,10 @@ def test_it_is_plain_json_and_complete() -> None:
 def test_the_command_can_be_given_to_a_shell_again(monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", ["/usr/bin/crossray", "run", "my job.yaml", "--set", "name=a;b"])
     assert command() == "crossray run 'my job.yaml' --set 'name=a;b'"
+    monkeypatch.setattr(sys, "argv", ["/somewhere/pipeline/__main__.py", "tables"])
+    assert command() == "python -m pipeline tables"
+    monkeypatch.setattr(sys, "argv", ["/somewhere/benchmarks/race.py", "--minutes", "1"])
+    assert command() == "python benchmarks/race.py --minutes 1"
 
 
 def test_the_commit_is_that_of_the_checkout() -> None:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.errors import CrossrayError
 from pipeline.launch.local import run_local
 from pipeline.metrics import psnr
 from pipeline.quickstart import Scored, quickstart_job, run_quickstart
+from pipeline.report.make import make_report
 
 PHOTOS = {"train": 12, "val": 1, "test": 2}
 
@@ -37,9 +39,20 @@ def test_leaves_a_summary_a_report_and_its_pictures(done):
     page = (out / "report.html").read_text()
     captions = ("photo", "clean truth", "NeRF, same budget", "Crossray", "predicted mask", "true mask", "depth")
     assert all(f"<figcaption>{c}</figcaption>" in page for c in captions)
-    assert "http" not in page.replace("http-equiv", "")  # offline
+    assert "http" not in page  # offline
+    assert page.count('class="stage"') == 5  # truth and rendering of two test photos and three training photos
     assert Image.open(out / "overview.png").size[0] > 1000
     assert len(list((out / "runs").glob("*/tensorboard/events*"))) == 2
+
+
+@pytest.mark.slow
+def test_the_report_is_made_again_from_what_is_there(done, tmp_path):
+    out, _, _ = done
+    page = make_report(out, tmp_path / "again.html")
+    assert page.read_text() == (out / "report.html").read_text()
+    (tmp_path / "summary.json").write_text('{"ranks": 1}')
+    with pytest.raises(CrossrayError, match=r"summary\.json: is not what the quick start writes"):
+        make_report(tmp_path)
 
 
 @pytest.mark.slow

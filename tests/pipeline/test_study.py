@@ -25,6 +25,7 @@ from tiny_run import cut_tiny, tiny_job, tiny_mapping
 
 from model.methods import METHODS
 from pipeline import cli
+from pipeline.cells import Cell
 from pipeline.config import JobError, make_job
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import evaluate_run
@@ -35,20 +36,14 @@ from pipeline.launch.stop import stopped_by_signals
 from pipeline.launch.study import needs_of, run_study, spec_of
 from pipeline.launch.tasks import TaskError, in_process, ray_tasks
 from pipeline.published import published_tables
-from pipeline.study import (
-    Cell,
+from pipeline.study import StudyJob, expand, load_study, make_study, read_kind, result_of
+from pipeline.study_tables import (
     Spread,
-    StudyJob,
     as_markdown,
     as_rich,
-    expand,
-    load_study,
-    make_study,
     make_table,
     make_tables,
     published_columns,
-    read_kind,
-    result_of,
     spread,
     tied_with_best,
 )

@@ -27,7 +27,7 @@ from pipeline.launch.tasks import in_process
 from pipeline.metrics import ssim_11
 from pipeline.photos import open_photos
 from pipeline.protocol import check_protocols, parse_protocol
-from pipeline.render import predicted_mask, read_appearance, render_picture
+from pipeline.render import colour_view, predicted_mask, read_appearance, render_picture, render_view
 from pipeline.runs import load_run
 from pipeline.shards import cut_shards
 from pipeline.train import train
@@ -72,8 +72,8 @@ def _environment(trained, monkeypatch):
     quick = {"mlp": FitRecipe(steps=7, rays=64), "hash": FitRecipe(steps=5, rays=64)}
 
     def parse(name):
-        protocol, downscale, affine = parse_protocol(name)
-        return protocol.model_copy(update={"fit": quick}), downscale, affine
+        protocol, downscale = parse_protocol(name)
+        return protocol.model_copy(update={"fit": quick}), downscale
 
     monkeypatch.setattr(module, "parse_protocol", parse)
 
@@ -171,7 +171,7 @@ def test_the_appearance_comes_from_the_next_view_in_the_same_light(responsive, p
         half = lent.resize((seen.width // 2, seen.height // 2), Image.Resampling.LANCZOS)
         appearance = read_appearance(responsive, np.asarray(half))
         expected = render_picture(responsive, light, appearance)[1]
-        _, picture = judge(responsive, photos, landmark).render(index)
+        picture = judge(responsive, photos, landmark).render(index).picture
         np.testing.assert_array_equal(picture, expected)
         own = render_picture(responsive, light, read_appearance(responsive, photos.reference(index)))[1]
         pictures.append(np.abs(picture - own).max())
@@ -187,14 +187,14 @@ def test_no_pixel_of_a_test_photo_is_seen_or_scored(trained, responsive, photos,
         for p in (photos, Doctored(photos, photos.indices("test")))
     )
     for index in photos.indices("test"):
-        before, after = (j.render(index)[1] for j in (plain, other))
+        before, after = (j.render(index).picture for j in (plain, other))
         np.testing.assert_array_equal(before, after)
         rounded = (255 * before).round().astype(np.uint8)
         assert plain.score(rounded, index, None) == other.score(rounded, index, None)
     seen = Judge(model, Doctored(photos, photos.indices("test")), module.parse_protocol("crnerf-full@R1")[0], None)
     usual = Judge(model, photos, module.parse_protocol("crnerf-full@R1")[0], None)
     (index, *_) = photos.indices("test")
-    assert (seen.render(index)[1] != usual.render(index)[1]).any()  # the paper's protocol does see them
+    assert (seen.render(index).picture != usual.render(index).picture).any()  # the paper's protocol does see them
 
 
 def test_elsewhere_is_the_next_test_photo_and_the_first_after_the_last():
@@ -227,6 +227,27 @@ def test_a_lent_picture_is_reduced_as_the_shards_reduce_theirs(trained, tmp_path
     for index in cut.indices("test"):
         np.testing.assert_array_equal(reduced(cut.image(index), factor), cut.reference(index))
     assert reduced(np.zeros((3, 40, 3), np.uint8), 8).shape == (1, 5, 3)
+
+
+def test_under_cross_fit_moves_the_appearance_to_the_whole_other_view(responsive, photos, landmark, monkeypatch):
+    """Nothing of the scored photo is seen, so nothing need be left out."""
+    calls, fit_map = [], judge_module.fit_map
+    monkeypatch.setattr(judge_module, "fit_map", lambda *a, **k: calls.append(a) or fit_map(*a, **k))
+    test, name = photos.indices("test"), "cross@R1+fit"
+    for index, following in zip(test, (*test[1:], test[0]), strict=True):
+        picture = judge(responsive, photos, landmark, name).render(index).picture
+        np.testing.assert_array_equal(
+            judge(responsive, Doctored(photos, test), landmark, name).render(index).picture, picture
+        )
+        _, view, image, columns, _, start = calls[-1]
+        seen, light = (photos.records[i] for i in (following, index))
+        np.testing.assert_array_equal(image, landmark.truth(seen.name, light.name))
+        assert columns == seen.width
+        own = render_view(responsive, seen)
+        torch.testing.assert_close(view.features, own.features)
+        before = colour_view(responsive, own, start)
+        after = colour_view(responsive, own, fit_map(*calls[-1]))
+        assert np.square(after - image / 255).mean() < np.square(before - image / 255).mean()
 
 
 # Learned codes

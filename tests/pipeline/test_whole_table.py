@@ -73,9 +73,9 @@ def _environment(cut):
 
 def quick_protocol(name: str):
     """A protocol with few samples, and codes that are fitted in a few steps."""
-    protocol, downscale, affine = parse_protocol(name)
+    protocol, downscale = parse_protocol(name)
     quick = dict.fromkeys(protocol.fit, FitRecipe(steps=5, rays=64))
-    return protocol.model_copy(update={"mlp_samples": (8, 8), "fit": quick}), downscale, affine
+    return protocol.model_copy(update={"mlp_samples": (8, 8), "fit": quick, "fit_read": quick}), downscale
 
 
 # One rank
@@ -127,6 +127,15 @@ def test_a_row_is_evaluated(straight, method, field):
     (row,) = result["images"]
     picture = Image.open(job.run / "eval" / "crnerf-full@R2" / f"step-{STEPS:08d}" / f"{row['key']}.png")
     assert picture.size == (24, 18)
+
+
+@pytest.mark.parametrize(
+    ("method", "field"), [row for row in TABLE if METHODS[row[0]].appearance in ("code", "crossray")]
+)
+def test_what_a_row_reads_can_be_fitted_further(straight, method, field):
+    result = evaluate_run(straight(method, field).run, "nerfw-half@R2+fit")
+    assert (result["definition"]["suffix"], result["appearance_from"]) == ("fit", "left")
+    assert 3 < result["mean"]["psnr"] < 60
 
 
 @EVERY_ROW
