@@ -90,7 +90,7 @@ def close(found: Tensor, expected: Tensor, name: str) -> None:
     assert error < TOLERANCE, f"{name}: off by {error:.1e} of its largest entry {scale:.1e}"
 
 
-@pytest.mark.parametrize(("count", "step"), [(1, 0), (2, 1500), (2, 5000)])
+@pytest.mark.parametrize(("count", "step"), [(1, 0), (2, 1500), pytest.param(2, 5000, marks=pytest.mark.slow)])
 def test_every_term_and_every_gradient(count, step):
     """Before and after the mask's weight has reached its floor, at 2,120 steps; with one patch and with two."""
     model, patches = faithful_model(seed=step), random_patches(seed=step, count=count)

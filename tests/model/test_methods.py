@@ -129,6 +129,7 @@ def test_only_a_transform_takes_statistics(row):
     check_spec(dataclasses.replace(spec, statistics="view"))
 
 
+@pytest.mark.slow
 def test_every_accepted_choice_takes_a_step_and_renders():
     """No part may assume a neighbour: all combinations, not only the rows."""
     specs = every_choice()

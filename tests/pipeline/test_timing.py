@@ -275,6 +275,7 @@ def cell(rows: list[TimingRow], method: str, count: int) -> TimingRow:
     return next(r for r in rows if (r.table, r.method, r.appearances, r.downscale) == ("inference", method, count, 8))
 
 
+@pytest.mark.slow
 class TestRows:
     def test_every_cell_of_the_papers_table(self, images):
         cells = {(r.method, r.appearances, r.downscale) for r in images if r.table == "inference"}
@@ -322,6 +323,7 @@ class TestRows:
             assert words in text
 
 
+@pytest.mark.slow
 def test_a_smaller_view_is_not_timed_again_where_less_of_the_larger_was(monkeypatch):
     calls = []
     inference = sys.modules["pipeline.timing_inference"]
@@ -529,6 +531,7 @@ def tiny_file(folder: Path) -> Path:
     return folder / "timing.yaml"
 
 
+@pytest.mark.slow
 def test_a_timing_is_run_like_any_job(crossray, tmp_path):
     status, out, _ = crossray("run", tiny_file(tmp_path), "--set", "name=t")
     assert status == 0
