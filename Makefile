@@ -14,7 +14,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BASELINES := .venv-nerfbaselines
 
-.PHONY: install quickstart test test-cluster test-nerfbaselines soak check check-model check-a-m check-n-z lint format clean
+.PHONY: install quickstart test test-cluster test-nerfbaselines soak check check-a-m check-n-z lint format clean
 
 install: $(STAMP)
 
@@ -29,13 +29,12 @@ quickstart: install
 	$(BIN)/crossray quickstart
 
 check: install
-	@OMP_NUM_THREADS=1 $(MAKE) --no-print-directory --jobs=2 --output-sync check-n-z check-model check-a-m lint
+	@OMP_NUM_THREADS=1 $(MAKE) --no-print-directory --jobs=2 --output-sync check-a-m check-n-z lint
 
 # Two processes are busy the whole time: the files of tests/pipeline are cut in the middle of the alphabet.
-check-model: CHECKED = tests/model
-check-a-m: CHECKED = tests/pipeline/test_[a-m]*.py
+check-a-m: CHECKED = tests/model tests/pipeline/test_[a-m]*.py
 check-n-z: CHECKED = tests/pipeline/test_[n-z]*.py
-check-model check-a-m check-n-z: install
+check-a-m check-n-z: install
 	$(BIN)/python -m pytest -q -m "not slow and not real and not cluster" $(CHECKED)
 
 test: install

@@ -1,12 +1,13 @@
 """How long the fast preset takes to reach what the faithful one reaches: the best validation PSNR of `crnerf` in an
-hour on one core, against `crossray` in a fiftieth of that.
+hour of one core's time, against `crossray` in a fiftieth of that.
 
-    python benchmarks/race.py [--minutes 60] [--out benchmarks/results/race.json]
+    python benchmarks/race.py [--minutes 60] [--ranks 1] [--out benchmarks/results/race.json]
 
-The scene is the quick start's landmark (144 training photos, 128 pixels). Each runs as one rank of one thread, the
-faithful one in the precision that suits this machine (bfloat16 where it computes with it). Their checkpoints are then
-scored on the 8 validation photos against the clean truth, the appearance read from the whole photo; samples a ray as in
-training. The seconds are those of the training loop, as training.json has them; evaluation is not counted.
+The scene is the quick start's landmark (144 training photos, 128 pixels). Ranks have one thread each and share the
+minutes: with two of them each run takes half as long. The faithful one has the precision that suits this machine
+(bfloat16 where it computes with it). Their checkpoints are then scored on the 8 validation photos against the clean
+truth, the appearance read from the whole photo; samples a ray as in training. The seconds are those of the training
+loop, as training.json has them; evaluation is not counted.
 """
 
 from __future__ import annotations
@@ -42,13 +43,14 @@ def crossray(folder: Path, *words: object) -> None:
     subprocess.run([sys.executable, "-m", "pipeline", *map(str, words)], cwd=folder, env=environment, check=True)
 
 
-def train(folder: Path, method: str, seconds: float, checkpoint_every: int) -> dict[str, Any]:
+def train(folder: Path, method: str, seconds: float, ranks: int, checkpoint_every: int) -> dict[str, Any]:
     """A run of so many seconds; what training.json says of it."""
     job = {
         "name": method,
         "method": method,
         "scene": {"path": "landmark", "downscale": 1, "reference_downscale": 1},
         "device": "cpu",
+        "ranks": ranks,
         "train": {
             "seconds": seconds,
             "checkpoint_every": checkpoint_every,
@@ -74,9 +76,9 @@ def validation_psnr(folder: Path, method: str, step: int) -> list[float]:
     return scores
 
 
-def measured(folder: Path, method: str, seconds: float, checkpoint_every: int) -> dict[str, Any]:
-    """A run, and the scores of its checkpoints."""
-    training = train(folder, method, seconds, checkpoint_every)
+def measured(folder: Path, method: str, seconds: float, ranks: int, checkpoint_every: int) -> dict[str, Any]:
+    """A run of so many seconds, and the scores of its checkpoints."""
+    training = train(folder, method, seconds, ranks, checkpoint_every)
     steps = [int(p.name.removeprefix("step-")) for p in committed(folder / "runs" / method / "checkpoints")]
     chosen = sorted({steps[round(i)] for i in np.linspace(0, len(steps) - 1, CHECKPOINTS + 1)[1:]})
     scores = {step: validation_psnr(folder, method, step) for step in chosen}
@@ -95,16 +97,17 @@ def main() -> None:
     """Run both, print the table, record."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--ranks", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/race.json"))
     options = parser.parse_args()
     where = provenance()
-    torch.set_num_threads(1)
+    torch.set_num_threads(options.ranks)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         crossray(folder, "landmark", "landmark", *PHOTOS)
-        seconds = 60 * options.minutes
-        fast = measured(folder, "crossray", seconds / SHARE, 200)
-        faithful = measured(folder, "crnerf", seconds, 50)
+        seconds = 60 * options.minutes / options.ranks
+        fast = measured(folder, "crossray", seconds / SHARE, options.ranks, 100)
+        faithful = measured(folder, "crnerf", seconds, options.ranks, 50)
     record = {"crossray": fast, "crnerf": faithful, "provenance": where}
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(record, indent=2) + "\n")

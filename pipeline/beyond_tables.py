@@ -117,7 +117,8 @@ def race(other: Other) -> list[Table]:
     runs = {name: other.content[name] for name in ("crnerf", "crossray") if isinstance(other.content.get(name), dict)}
     rows = []
     for name, run in runs.items():
-        texts = [f"{run['seconds']:,.0f} s", f"{run['training']['steps']:,}", mean_of(run["images"])]
+        budget = f"{run['seconds']:,.0f} s on {run['training']['ranks']} cores"
+        texts = [budget, f"{run['training']['steps']:,}", mean_of(run["images"])]
         rows.append(Row(LABELS[name], True, entries_of([*texts, f"step {run['best_step']:,}"], other)))
     heads = heads_of("training", "steps", "best validation PSNR", "reached at")
     text = "Landmark, 8 validation photos against the clean truth (`benchmarks/race.py`)."
