@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from model.fields.base import Rays
+from pipeline.files import atomic_write
 from pipeline.provenance import provenance
 from pipeline.render import View, recoloured, statistics_of, view_rays
 from pipeline.timing_inference import Setting, chunk_of, first, settings
@@ -176,8 +177,7 @@ def main() -> None:
         print(f"| {row['bar']} | {row['measured']:.3g} | {row['wanted']} | {'met' if row['met'] else 'MISSED'} |")
     if options.out:
         record = {"bars": table, "presets": {n: as_record(m) for n, m in found.items()}, "provenance": where}
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(record, indent=1) + "\n")
+        atomic_write(options.out, json.dumps(record, indent=1) + "\n")
     sys.exit(0 if all(row["met"] for row in table) else 1)
 
 

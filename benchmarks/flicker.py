@@ -31,6 +31,8 @@ import torch
 
 from model.methods import StatisticsPolicy
 from pipeline.bootstrap import paired_interval
+from pipeline.checkpoint import MODEL
+from pipeline.files import atomic_write
 from pipeline.flicker import flicker, true_drift, walk
 from pipeline.judge import Judge, Shared
 from pipeline.metrics import to_8bit
@@ -71,6 +73,7 @@ def measured(run: Path, frames: int, side: int) -> dict[str, Any]:
         "seed": job.patch.seed,
         "seconds": job.train.seconds,
         "step": checkpoint.step,
+        "checkpoint_sha256": checkpoint.meta["sha256"][MODEL],
         "truth": true_drift(landmark, path, names)._asdict(),
         "flicker": {policy: drift._asdict() for policy, drift in drifts.items()},
         "psnr": {name: psnr_by_policy(judge, test) for name, judge in judges.items()},
@@ -123,8 +126,7 @@ def main() -> None:
         "psnr_less_view": against,
         "provenance": where,
     }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(record, indent=1) + "\n")
+    atomic_write(options.out, json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

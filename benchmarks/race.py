@@ -24,13 +24,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipeline.checkpoint import committed
+from pipeline.checkpoint import MODEL, committed
+from pipeline.files import atomic_write
 from pipeline.landmark import Landmark
 from pipeline.metrics import psnr, to_8bit
 from pipeline.photos import open_photos
 from pipeline.provenance import provenance
 from pipeline.render import read_appearance, render_picture
-from pipeline.runs import load_run
+from pipeline.runs import checkpoint_of, load_run
 
 SHARE = 50  # the fast preset gets one of so many parts of the time
 CHECKPOINTS = 4  # of each run, spread over it
@@ -88,6 +89,7 @@ def measured(folder: Path, method: str, seconds: float, ranks: int, checkpoint_e
         "training": training,
         "psnr": {step: float(np.mean(values)) for step, values in scores.items()},
         "best_step": best,
+        "checkpoint_sha256": checkpoint_of(folder / "runs" / method, best).meta["sha256"][MODEL],
         "best_psnr": float(np.mean(scores[best])),
         "images": scores[best],
     }
@@ -109,8 +111,7 @@ def main() -> None:
         fast = measured(folder, "crossray", seconds / SHARE, options.ranks, 100)
         faithful = measured(folder, "crnerf", seconds, options.ranks, 50)
     record = {"crossray": fast, "crnerf": faithful, "provenance": where}
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(record, indent=2) + "\n")
+    atomic_write(options.out, json.dumps(record, indent=2) + "\n")
     for method in ("crnerf", "crossray"):
         run = record[method]
         print(f"{method:10} {run['seconds']:6.0f} s  {run['training']['steps']:6} steps  PSNR {run['best_psnr']:.2f}")

@@ -95,23 +95,22 @@ def bake_run(
     F = None
     if model.encoder is not None:
         F = interpolated(chosen[0].F, chosen[1].F, share) if len(chosen) > 1 else chosen[0].F
+    about = {"appearances": [c.source for c in chosen], "share": share if len(chosen) > 1 else None}
+    folder = out or run / "baked" / folder_name([appearance, *([] if towards is None else [towards])], share)
+    claim(folder, about)
     content, taken = fixed_statistics(model, photos)
     baked = bake(model, model.colour_map(content, F))
-
     record = {
         "format": FORMAT,
         "method": job.method,
         "spec": asdict(job.model),
-        "appearances": [c.source for c in chosen],
-        "share": share if len(chosen) > 1 else None,
+        **about,
         "statistics": taken,
         "run": job.name,
         "step": checkpoint.step,
         "checkpoint_sha256": checkpoint.meta["sha256"][MODEL],
         "provenance": provenance(),
     }
-    folder = out or run / "baked" / folder_name([appearance, *([] if towards is None else [towards])], share)
-    claim(folder, record)
     write_baked(folder, baked, record, preview(baked, photos))
     return folder
 
@@ -122,8 +121,8 @@ def folder_name(names: Sequence[str], share: float) -> str:
     return "-".join([*stems, f"{share:g}"] if len(stems) > 1 else stems)
 
 
-def claim(folder: Path, record: dict[str, Any]) -> None:
-    """CrossrayError where the folder holds something else: other files, or another appearance."""
+def claim(folder: Path, about: dict[str, Any]) -> None:
+    """CrossrayError where the folder holds something else: other files, or another appearance than `about` says."""
     if not folder.exists():
         return
     strange = sorted(
@@ -133,7 +132,7 @@ def claim(folder: Path, record: dict[str, Any]) -> None:
         raise CrossrayError(f"{folder} holds {strange[0]}, which is no baked appearance; --out names another folder")
     try:
         found = json.loads((folder / RECORD).read_text())
-        same = found["appearances"] == record["appearances"] and found["share"] == record["share"]
+        same = all(found[key] == value for key, value in about.items())
     except (OSError, ValueError, KeyError, TypeError):
         return  # not completed, or damaged: it is written anew
     if not same:
@@ -154,8 +153,7 @@ def find_appearance(model: SceneModel, photos: Photos, name: str) -> Read:
         index = records[name]
         picture, sha256 = photos.reference(index), photos.records[index].source_sha256
     elif Path(name).is_file():
-        content = Path(name).read_bytes()
-        picture, sha256 = read_picture(Path(name)), hashlib.sha256(content).hexdigest()
+        picture, sha256 = read_picture(Path(name)), sha256_of(Path(name))
         picture = reduced(picture, photos.manifest.reference_downscale)
     else:
         close = difflib.get_close_matches(name, records, n=1, cutoff=0.5)

@@ -92,8 +92,12 @@ def cost(times: Sequence[Timed]) -> list[Table]:
     found = [timed for timed in times if timed.row.table == "cost"]
     if not found:
         return []
+    newest: dict[tuple[object, ...], Timed] = {}
+    for timed in sorted(found, key=lambda timed: timed.source.date or ""):
+        row = timed.row
+        newest[(place_of(row), row.method, row.field, row.varied)] = timed
     rows = []
-    for timed in found:
+    for timed in sorted(newest.values(), key=found.index):
         row = timed.row
         pixels = (row.width or 0) * (row.height or 0)
         value = {"rays": row.rays, "photos": row.photos, "pixels": pixels}[row.varied or "rays"] or 0

@@ -8,6 +8,7 @@ import platform
 import shlex
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -16,20 +17,22 @@ from typing import Any
 import psutil
 import torch
 
-PACKAGES = ("torch", "numpy", "pillow", "scikit-image")
+PACKAGES = ("torch", "numpy", "pillow", "scikit-image", "ray")
+CODE = ("model", "pipeline", "jobs", "benchmarks/*.py")
 
 
 def provenance() -> dict[str, Any]:
     """The command of this process, the commit, the moment (UTC, ISO 8601), the hardware, and versions; JSON values.
 
-    `commit` is None outside a git checkout, and ends with `-changed` where files have changed since.
+    `commit` is None outside a git checkout, and ends with `-changed` where code has changed since. Versions are of what
+    is installed of PACKAGES.
     """
     return {
         "command": command(),
         "commit": commit(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "hardware": hardware(),
-        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "versions": versions(),
         "python": platform.python_version(),
     }
 
@@ -59,7 +62,16 @@ def commit() -> str | None:
         return found.stdout.strip() if found.returncode == 0 else None
 
     head = git("rev-parse", "HEAD") if (root / ".git").exists() else None
-    return head and head + ("-changed" if git("status", "--porcelain") else "")
+    return head and head + ("-changed" if git("status", "--porcelain", "--", *CODE) else "")
+
+
+def versions() -> dict[str, str]:
+    """Package -> version."""
+    found = {}
+    for name in PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
 
 
 def hardware() -> dict[str, Any]:

@@ -36,6 +36,7 @@ class Budget(NamedTuple):
     ranks: int
     threads: int  # of a rank, on CPU
     device: str  # cpu or cuda; "elsewhere" for a released checkpoint that was imported
+    machine: str = ""  # what it ran on, where the budget is one of seconds: they are worth what the machine is
 
     def __str__(self) -> str:
         if self.device == "elsewhere":

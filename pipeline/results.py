@@ -124,7 +124,7 @@ def usable(path: Path, read: Any) -> Iterator[Any]:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         log.warning("%s: left out of the tables: %s: %s", path, where or "file", first["msg"])
-    except (CrossrayError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (CrossrayError, OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
         log.warning("%s: left out of the tables: %s", path, error)
 
 
@@ -220,7 +220,9 @@ def score_of(about: Trainee, protocol: str, evaluated: Evaluated, source: Source
     meaning = meaning_today(protocol)
     if evaluated.definition is not None:
         meaning = meaning_of(evaluated.definition)
-    notes = ("the protocol's definition is not recorded",) if evaluated.definition is None else ()
+    notes = ["the protocol's definition is not recorded"] if evaluated.definition is None else []
+    if evaluated.definition is not None and fitted_otherwise(job, protocol, evaluated.definition):
+        notes.append("fitted to the test photo by another recipe than today's")
     design, settings = design_of(job, about.label)
     if evaluated.statistics not in (None, "none"):
         settings = (*settings, f"statistics={evaluated.statistics}")
@@ -238,13 +240,23 @@ def score_of(about: Trainee, protocol: str, evaluated: Evaluated, source: Source
         steps=about.steps,
         images={str(row["name"]): numbers(row) for row in evaluated.images},
         checkpoint=about.checkpoint,
-        source=replace(source, settings=settings, notes=notes),
+        source=replace(source, settings=settings, notes=tuple(notes)),
     )
 
 
 def meaning_of(definition: dict[str, Any]) -> tuple[str, ...]:
     """What of a protocol's definition moves scores."""
     return tuple(f"{key}: {definition.get(key)}" for key in MEANING)
+
+
+def fitted_otherwise(job: Job, protocol: str, definition: dict[str, Any]) -> bool:
+    """Whether something was fitted to the test photo, by a recipe that the protocol does not have any more."""
+    key = "fit" if job.model.appearance == "embedding" else "fit_read" if protocol.endswith("+fit") else None
+    if key is None:
+        return False
+    was = as_dict(as_dict(definition.get(key)).get(job.model.field))
+    now = parse_protocol(protocol)[0].model_dump(mode="json")[key][job.model.field]
+    return any(now.get(name) != value for name, value in was.items())
 
 
 @cache
@@ -271,7 +283,7 @@ def budget_of(job: Job, device: str | None, where: dict[str, Any]) -> Budget:
     kind = job.device if job.device != "auto" else "cuda" if device in gpus or "NVIDIA" in (device or "") else "cpu"
     threads, train = job.threads if kind == "cpu" else 1, job.train
     if train.seconds is not None:
-        return Budget(train.seconds, None, None, job.ranks, threads, kind)
+        return Budget(train.seconds, None, None, job.ranks, threads, kind, device or "")
     return Budget(None, train.epochs, train.steps_per_epoch, job.ranks, threads, kind)
 
 
@@ -337,6 +349,8 @@ def origin(path: Path, run: str | None, *where: dict[str, Any], device: str | No
     commit, hardware = first("commit"), first("hardware")
     if isinstance(hardware, dict):
         machine = hardware_of(hardware)
+        if device and device not in machine:  # whoever recorded it need not be who computed it
+            machine = f"{device}; recorded on {machine}"
     else:
         processor = device or first("processor") or first("device")
         machine = ", ".join(str(part) for part in (processor, first("machine"), cores_of(first("cores"))) if part)

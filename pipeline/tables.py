@@ -209,7 +209,7 @@ def siblings(column: Column, columns: Sequence[Column]) -> tuple[str, ...]:
 def head_of(column: Column, columns: Sequence[Column], metrics: Sequence[str]) -> Head:
     """What a reader has to know of a column."""
     lines = [PAPER_SCENES.get(column.scene, column.scene), column.protocol, FIELDS[column.field]]
-    lines += str(column.budget).split(", ")
+    lines += [*str(column.budget).split(", "), *filter(None, [column.budget.machine])]
     photos = f"{len(column.photos)} photos" if column.photos else "nothing measured yet"
     alike = [c for c in columns if c != column and c[:2] == column[:2] and c.photos != column.photos]
     if column.photos and alike:

@@ -29,8 +29,9 @@ INFERENCE = (
     "reading of the appearance, warm-up left out. Multiple images are of one view, each in another appearance."
 )
 TRAINING = (
-    'The paper\'s table "trainingtime": 20 epochs of 17,200 iterations on 8 TITAN Xp. Ours: the same schedule, '
-    "extrapolated from measured steps (median and quartiles)."
+    'The paper\'s table "trainingtime": 20 epochs of 17,200 iterations on 8 TITAN Xp, of 8 × 1,024 rays '
+    "each. Ours: as many steps as a column says, extrapolated from measured ones (median and quartiles); with fewer "
+    "ranks they see fewer rays in all."
 )
 
 
@@ -48,6 +49,8 @@ class Place(NamedTuple):
     downscale: int | None
     appearances: int | None
     photos: int | None
+    rays: int | None
+    steps: int | None
 
 
 def time_tables(times: Sequence[Timed]) -> list[Table]:
@@ -137,20 +140,23 @@ def place_of(row: TimingRow) -> Place:
         row.downscale,
         row.appearances,
         row.photos,
+        row.rays,
+        row.steps,
     )
 
 
 def head_of(place: Place) -> Head:
     """What a reader has to know of a column of ours."""
     unit = f", {place.threads} thread{'s' * (place.threads > 1)}" if place.memory_of == "host" else ""
-    lines = [f"{place.device}{unit}" + (f", {place.ranks} ranks" if place.ranks > 1 else ""), place.precision]
+    lines = [f"{place.device}{unit}", place.precision]
     if place.downscale is not None:
         count = place.appearances or 1
         lines.insert(0, f"{'a single image' if count == 1 else f'{count} images of a view'}, R/{place.downscale}")
         lines.append(f"{place.width} × {place.height}")
         lines.append(f"samples {COUNTED[place.samples_as == 'evaluated']}")
-    if place.photos is not None:
-        lines.append(f"{place.photos} photos")
+    else:
+        ranks = f"{place.ranks} rank{'s' * (place.ranks > 1)}"
+        lines = [f"{ranks} × {place.rays or 0:,} rays", f"{place.steps or 0:,} steps", *lines, f"{place.photos} photos"]
     return Head("ours", tuple(lines))
 
 
@@ -173,7 +179,9 @@ def time_entry(
     )
     if not found:
         one_count = line[1] == "hash" and place.samples_as == "evaluated"  # of samples, on the fast field
-        fits = line[0] in METHODS and METHODS[line[0]].field == line[1] and not one_count
+        known = METHODS.get(line[0])
+        one_image = known is not None and known.appearance == "none" and (place.appearances or 1) > 1
+        fits = known is not None and known.field == line[1] and not one_count and not one_image
         return Entry("lacking", command=filling(command, line[0], place)) if fits else NONE
     *others, chosen = found
     cells = lines_of(chosen.row)
@@ -189,15 +197,16 @@ def filling(command: str, method: str, place: Place) -> str:
     if place.memory_of == "host":
         settings.append(f"threads={place.threads}")
     if place.downscale is not None:
-        many = [] if place.appearances in (None, 1) else [f"inference.images={place.appearances}"]
+        count = place.appearances or 1
+        many = [f"inference.images={count}", *(["inference.appearances=[1]"] if count == 1 else [])]
         settings += [
             *(f"inference.methods=[{method}]", f"inference.samples=[{place.samples_as}]"),
             *(f"inference.downscales=[{place.downscale}]", *many),
             *(f"width={(place.width or 0) * place.downscale}", f"height={(place.height or 0) * place.downscale}"),
         ]
     else:
-        photos = [] if place.photos is None else [f"training.photos={place.photos}"]
-        settings += [f"training.methods=[{method}]", f"training.ranks={place.ranks}", *photos]
+        settings += [f"training.methods=[{method}]", f"training.ranks={place.ranks}", f"training.rays={place.rays}"]
+        settings.append(f"training.photos={place.photos}")
     return shlex.join([*command.split(), *(word for setting in settings for word in ("--set", setting))])
 
 
@@ -212,7 +221,7 @@ def step_lines(row: TimingRow) -> list[Cell]:
     """Minutes of the schedule, and a step."""
     minutes = "-" if row.minutes is None else f"{row.minutes:,.0f} min"
     step = f"{row.seconds:.3g} s a step [{row.low:.3g}, {row.high:.3g}]"
-    return [Cell(minutes), Cell(f"{step}, {row.rays or 0:,} rays", small=True), *common_lines(row)]
+    return [Cell(minutes), Cell(step, small=True), *common_lines(row)]
 
 
 def common_lines(row: TimingRow) -> list[Cell]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
@@ -22,7 +22,7 @@ TIMING = "timing.json"
 class TimingRow(BaseModel):
     """One measured time, with all that it depends on."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
     table: Literal["inference", "training", "appearances", "cost"]
     """Which table it belongs to."""
@@ -47,7 +47,7 @@ class TimingRow(BaseModel):
     """Whether these are the counts of training, or those of the reference's evaluation."""
     unit: Literal["image", "step"]
     """What `seconds` are of."""
-    seconds: float
+    seconds: float = Field(gt=0)
     """Median of a unit. Of images: without the reading of the appearance (`encode_seconds`)."""
     low: float
     """First quartile; where parts were timed apart, the sum of theirs."""
@@ -56,13 +56,15 @@ class TimingRow(BaseModel):
     repeats: int
     """Measurements behind the median; where parts were timed apart, of the one with the fewest."""
     minutes: float | None = None
-    """Of the paper's whole schedule, extrapolated from `seconds`; None for images."""
+    """Of a whole schedule, extrapolated from `seconds`; None for images."""
+    steps: int | None = None
+    """Of that schedule: the paper's has 20 x 17,200."""
     extrapolated: str | None = None
     """A sentence that says from what; None where a whole unit was measured."""
     peak_memory_MiB: float | None
     """Most that was held at once: on `cuda` of torch's allocator, model included; on `host` what the process grew by
     above its size before. None where the system does not tell. Of an extrapolated image: of the rays that were timed;
-    with several ranks: of rank 0."""
+    of several images: with two of them; with several ranks: of rank 0."""
     memory_of: Literal["host", "cuda"]
     """Whose memory."""
     rays: int | None = None

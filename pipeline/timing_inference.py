@@ -30,10 +30,9 @@ from pipeline.config import Job
 from pipeline.provenance import device_name
 from pipeline.render import STATISTICS_SIDE, View, recoloured, statistics_of, view_rays
 from pipeline.timing import TimingRow
-from pipeline.timing_job import TimingJob, method_job, threads_of, with_precision
+from pipeline.timing_job import TimingJob, method_job, threads_of
 from pipeline.timing_measure import LEAST, Meter, PeakMemory, Seconds, counted_flops, memory_of
 from pipeline.timing_scene import camera, reference_photo, untrained
-from pipeline.train import uses_bfloat16
 
 log = logging.getLogger("crossray")
 
@@ -43,17 +42,20 @@ COUNTED = 16  # rays whose operations are counted
 
 
 class TimedRays(NamedTuple):
-    """What some rays took."""
+    """What some rays of a view took."""
 
     seconds: Seconds
     rays: int
+    view: int  # rays of the view that they are of
 
     def of(self, rays: int) -> Seconds:
         """What `rays` take."""
         return self.seconds.times(rays / self.rays)
 
     def sentence(self, rays: int) -> str | None:
-        """From what the time of `rays` is extrapolated; None if it is not."""
+        """From what the time of a view of `rays` is extrapolated; None if it is not."""
+        if rays != self.view:
+            return f"from {self.rays:,} rays of a larger view"
         return None if rays == self.rays else f"from {self.rays:,} of its {rays:,} rays"
 
 
@@ -74,7 +76,16 @@ class Parts(NamedTuple):
     how: str  # what an image more is
     encode: float | None
     flops: float  # of the rendering, once
-    extrapolated: str | None
+    once_from: str | None  # from what `once` is extrapolated
+    each_from: str | None  # from what `each` is
+
+    def extrapolated(self, count: int) -> str | None:
+        """From what the time of an image is when `count` share the view."""
+        parts = [f"the view {self.once_from}"] if self.once_from else []
+        parts += [f"an image more {self.each_from}"] if self.each_from else []
+        if count > LOOKS:
+            parts.append(f"{LOOKS} of the {count} images were made")
+        return "; ".join(parts) or None
 
     def image(self, count: int) -> Seconds:
         """Seconds an image when `count` share the view."""
@@ -124,24 +135,18 @@ def inference_rows(timing: TimingJob, meter: Meter, peak: Callable[[str], float]
 def settings(
     timing: TimingJob, method: str, device: torch.device, samples: Sequence[str] = ("trained", "evaluated")
 ) -> Iterator[Setting]:
-    """A method in each precision, with those of `samples` that it has."""
+    """A method in each precision, by default in float32, in which pictures are rendered, with those of `samples` that
+    it has."""
     job = method_job(timing, method)
     mlp, hashed = job.model.mlp, job.model.hash
     counts = {"trained": (mlp.coarse_samples, mlp.fine_samples), "evaluated": EVALUATED}
     if job.model.field == "hash":
         counts = {"trained": (hashed.proposal_samples, hashed.samples)}
-    for precision in precisions(timing, job, device):
+    for precision in ("float32",) if timing.precision == "auto" else timing.precision:
         model = untrained(job, device, precision == "bfloat16")
         for name in counts:
             if name in samples:
                 yield Setting(job, model, counts[name], name, precision)
-
-
-def precisions(timing: TimingJob, job: Job, device: torch.device) -> tuple[str, ...]:
-    """In which a method is timed: as the job says; `auto` adds bfloat16 where a training would choose it."""
-    if timing.precision != "auto":
-        return timing.precision
-    return ("float32", "bfloat16") if uses_bfloat16(with_precision(job, "auto"), device) else ("float32",)
 
 
 def views(
@@ -191,7 +196,7 @@ def image_row(
         "low": seconds.low,
         "high": seconds.high,
         "repeats": seconds.repeats,
-        "extrapolated": parts.extrapolated,
+        "extrapolated": parts.extrapolated(count),
         "peak_memory_MiB": seconds.memory,
         "memory_of": memory_of(meter.device),
         "threads": threads_of(timing),
@@ -230,7 +235,7 @@ def fused_parts(
     view = View(size, features, torch.empty(0), torch.empty(0))
     if model.transform is None:
         coloured = meter.measure(lambda: eight_bit(model.colours(features[None], None)[0]))
-        return Parts(rendered.plus(coloured), None, "rendered", None, flops, sentence)
+        return Parts(rendered.plus(coloured), None, "rendered", None, flops, sentence, None)
 
     def statistics() -> ContentStatistics | None:
         points = model.point_features(grid_rays(rays, size), setting.samples) if model.fuses_points else None
@@ -239,7 +244,7 @@ def fused_parts(
     content, appearances = statistics(), model.encode([reference]).expand(LOOKS, -1, -1, -1)
     once = rendered.plus(meter.measure(statistics))
     each = meter.measure(lambda: recoloured(view, model.colour_map(content, appearances))).times(1 / LOOKS)
-    return Parts(once, each, "recoloured", timed.encode, flops, sentence)
+    return Parts(once, each, "recoloured", timed.encode, flops, sentence, None)
 
 
 def time_codes(meter: Meter, setting: Setting, rays: Rays, reference: Tensor) -> Timed:
@@ -259,7 +264,7 @@ def time_codes(meter: Meter, setting: Setting, rays: Rays, reference: Tensor) ->
         for _ in range(LOOKS):
             look(model, placed, code)
 
-    looking = TimedRays(meter.measure(looks).times(1 / LOOKS), len(placed.t))
+    looking = TimedRays(meter.measure(looks).times(1 / LOOKS), len(placed.t), len(rays.near))
     flops = flops_a_ray(lambda some: look(model, place(some), code), rays)
     timed = time_rays(meter, rays, chunk_of(setting), place)
     return Timed(timed, looking, flops, encoding(meter, model, reference))
@@ -279,6 +284,7 @@ def coded_parts(
         timed.encode,
         total * timed.flops,
         timed.once.sentence(total),
+        timed.each.sentence(total),
     )
 
 
@@ -306,7 +312,7 @@ def time_rays(meter: Meter, rays: Rays, chunk: int, work: Callable[[Rays], objec
     part = first(rays, count)
     if count > len(some.near):
         seconds = meter.once(lambda: work(part))
-    return TimedRays(meter.repeated(lambda: work(part), seconds, memory), count)
+    return TimedRays(meter.repeated(lambda: work(part), seconds, memory), count, total)
 
 
 def chunk_of(setting: Setting) -> int:

@@ -55,7 +55,7 @@ class TrainingTiming(Section):
     """Of the schedule whose minutes are extrapolated."""
     steps_per_epoch: int = Field(17200, ge=1)
     """Of that schedule."""
-    cost_rays: tuple[int, ...] = (400, 576, 784, 1024, 1600)
+    cost_rays: tuple[Positive, ...] = (400, 576, 784, 1024, 1600)
     """Rays a step that are compared, of the methods in `cost`."""
     cost_photos: tuple[Positive, ...] = (50, 500, 5000)
     """Numbers of training photos that are compared; the cost must not depend on them."""
@@ -128,9 +128,7 @@ def make_timing(raw: dict[str, Any], settings: Sequence[str] = (), source: str =
         raise JobError("\n".join(f"{source}: {explain(e, TimingJob)}" for e in error.errors())) from None
     try:
         check_timing(timing)
-    except ValueError as error:
-        raise JobError(f"{source}: {error}") from None
-    except JobError as error:
+    except (ValueError, JobError) as error:
         raise JobError(f"{source}: {error}") from None
     return timing
 

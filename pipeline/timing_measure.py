@@ -110,6 +110,7 @@ class PeakMemory:
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.before: int | None = None
+        gc.collect()
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
             return
@@ -130,7 +131,6 @@ class PeakMemory:
 def give_back() -> None:
     """Return what this process has freed to the system: else what is measured next would find room in it, and not be
     seen to grow."""
-    gc.collect()
     with suppress(AttributeError, OSError):  # only glibc has it
         ctypes.CDLL(None).malloc_trim(0)
 

@@ -21,10 +21,10 @@ from pipeline.photos import Photos
 from pipeline.provenance import device_name
 from pipeline.record import LossRecord, record_path
 from pipeline.timing import TimingRow
-from pipeline.timing_inference import precisions
 from pipeline.timing_job import TimingJob, training_job, with_precision
 from pipeline.timing_measure import Meter, Seconds, counted_flops, memory_of
 from pipeline.timing_scene import synthetic_photos
+from pipeline.together import agree, control_group
 from pipeline.train import (
     LOOK_EVERY,
     build_model,
@@ -34,6 +34,7 @@ from pipeline.train import (
     set_learning_rates,
     set_up_torch,
     training_step,
+    uses_bfloat16,
 )
 from pipeline.work import Context, Work
 
@@ -64,6 +65,13 @@ def training_rows(timing: TimingJob, context: Context, meter: Meter, peak: Calla
             row = step_row("cost", job, synthetic_photos(timing, count), context, meter, peak)
             rows.append(row.model_copy(update={"varied": "photos"}))
     return rows
+
+
+def precisions(timing: TimingJob, job: Job, device: torch.device) -> tuple[str, ...]:
+    """In which a method is timed: as the job says; `auto` adds bfloat16 where a training would choose it."""
+    if timing.precision != "auto":
+        return timing.precision
+    return ("float32", "bfloat16") if uses_bfloat16(with_precision(job, "auto"), device) else ("float32",)
 
 
 def step_row(
@@ -114,6 +122,7 @@ def schedule(job: Job, seconds: Seconds, block: int = 1) -> dict[str, Any]:
     steps = job.train.epochs * job.train.steps_per_epoch
     return {
         "minutes": steps * seconds.median / 60,
+        "steps": steps,
         "extrapolated": f"{job.train.epochs} x {job.train.steps_per_epoch:,} steps, from the median of "
         f"{seconds.repeats * block:,} measured ones",
     }
@@ -150,15 +159,18 @@ class Steps:
         self.model = build_model(job, photos, context.device)
         self.optimiser = build_optimiser(self.model, job.train)
         self.ddp = distribute(self.model, context)
+        self.together = control_group(context)
         self.record = LossRecord(record_path(job.run, context.rank), 0)
         self.clock = Clock(job.train.epochs * job.train.steps_per_epoch, None)
 
     def run(self, count: int) -> None:
-        """`count` steps, then a look at their losses, as the training loop has one now and then."""
+        """`count` steps, after each of which the ranks agree, then a look at their losses, as the training loop has one
+        now and then."""
         for _ in range(count):
             set_learning_rates(self.optimiser, self.work.job.train, self.clock)
             training_step(self.work, self.ddp, self.optimiser, self.clock.step, self.record)
             self.clock.step += 1
+            agree(self.together, self.work.context, 0.0)
         self.record.look()
 
     def flops(self) -> float:

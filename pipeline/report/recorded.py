@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from pipeline.bootstrap import interval
 from pipeline.errors import CrossrayError
 from pipeline.record import read_losses
 from pipeline.report.plots import Series
+from pipeline.timing import TIMING, TimingRow, read_timing
 
 Result = dict[str, Any]  # what a metrics.json holds
 
@@ -56,11 +58,13 @@ def read_evaluations(run: Path) -> Evaluations:
 def is_result(result: Result) -> bool:
     """Whether a metrics.json has what the page is made of."""
     try:
-        rows = [(row["name"], row["key"], float(row["psnr"])) for row in result["images"]]
-        means = [float(value) for value in result["mean"].values() if value is not None]
-        return bool(rows and means and result["protocol"]) and isinstance(result["step"], int)
-    except (KeyError, TypeError, ValueError, AttributeError):
+        images, mean = result["images"], result["mean"]
+        texts = [result["protocol"], *(row[key] for row in images for key in ("name", "key"))]
+        numbers = [mean["psnr"], *(row["psnr"] for row in images), *(v for v in mean.values() if v is not None)]
+    except (KeyError, TypeError, AttributeError):
         return False
+    right = all(isinstance(t, str) for t in texts) and all(isinstance(n, int | float) for n in numbers)
+    return bool(images) and right and isinstance(result.get("step"), int)
 
 
 def scores_of(result: Result, metric: str) -> list[float]:
@@ -115,10 +119,10 @@ def read_loss_curves(run: Path) -> dict[str, Series]:
     return {name: Series(name, steps, losses.rows[:, i].astype(np.float64)) for i, name in enumerate(losses.names)}
 
 
-def read_timing(run: Path) -> list[dict[str, Any]]:
-    """The rows of timing.json in the run's folder, or in the folder that it is in."""
-    for folder in (run, run.parent):
-        rows = (read_json(folder / "timing.json") or {}).get("rows")
-        if isinstance(rows, list):
-            return [row for row in rows if isinstance(row, dict)]
-    return []
+def timings_beside(run: Path, method: str, field: str) -> list[TimingRow]:
+    """What the timings beside a run (`crossray timing`) measured of its method."""
+    rows: list[TimingRow] = []
+    for path in sorted(run.parent.glob(f"*/{TIMING}")):
+        with suppress(CrossrayError):  # the tables tell what is wrong with it
+            rows += [row for row in read_timing(path).rows if (row.method, row.field) == (method, field)]
+    return rows

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
+from model.scene_model import SceneModel
 from pipeline.cells import METRICS, title_of
 from pipeline.checkpoint import MODEL, Checkpoint, folder_name
 from pipeline.config import Job
@@ -52,13 +53,15 @@ from pipeline.report.recorded import (
     read_evaluations,
     read_json,
     read_loss_curves,
-    read_timing,
+    timings_beside,
 )
 from pipeline.report.words import between, count, number, scored, shell, short
 from pipeline.runs import checkpoint_of, job_of, model_of, photos_of
 from pipeline.status import duration, status_of
+from pipeline.timing import TimingRow
 from pipeline.truth import truth_of
 
+TRAINED = {"steps", "train_seconds", "ranks", "rays_a_step", "device"}  # what a training.json has
 SLIDERS = 6  # a protocol: from the worst view to the best
 SIDE = 640  # pixels of a picture under a slider, at most
 THUMBNAIL = 112
@@ -85,6 +88,7 @@ class Found(NamedTuple):
     checkpoint: Checkpoint | None
     photos: Photos | None
     landmark: Landmark | None
+    model: SceneModel | None
     missing: dict[str, str]
 
 
@@ -97,6 +101,7 @@ def write_run_report(run: Path, out: Path) -> Path:
     found, album = look_at(run), Album()
     results = found.evaluations.newest()
     views = [(result, picture_of(found, result)) for result in results.values()]
+    first = hero(views[0], album) if views else None  # before the others: it is the last to be left out for room
     sections = [
         Section("pictures", "Truth and rendering", HOW_TO_SLIDE, picture_blocks(found, views, album)),
         Section("appearances", "Appearances", *appearances(found, album)),
@@ -112,7 +117,7 @@ def write_run_report(run: Path, out: Path) -> Path:
         lead=lead(found),
         summary=headline(found, results),
         sections=[section for section in sections if section.blocks],
-        hero=hero(views[0], album) if views else None,
+        hero=first,
         foot=album.foot,
     )
     return write_page(out, page)
@@ -126,15 +131,18 @@ def look_at(run: Path) -> Found:
     def attempt(name: str, get: Callable[[], Any]) -> Any:
         try:
             return get()
-        except (CrossrayError, OSError) as error:
+        except (CrossrayError, OSError, RuntimeError) as error:  # RuntimeError: weights of another model
             missing[name] = str(error)
             return None
 
     checkpoint = attempt("checkpoint", lambda: checkpoint_of(run))
     photos = attempt("photos", lambda: photos_of(job, checkpoint)) if checkpoint else None
     landmark = attempt("landmark", lambda: truth_of(job, photos)) if photos else None
-    training = read_json(run / "training.json")
-    return Found(run, job, training, read_evaluations(run), checkpoint, photos, landmark, missing)
+    model = attempt("model", lambda: model_of(job, checkpoint)) if checkpoint else None
+    training = read_json(run / "training.json") or {}
+    if not training.keys() >= TRAINED:
+        training = {}
+    return Found(run, job, training or None, read_evaluations(run), checkpoint, photos, landmark, model, missing)
 
 
 # ------------------------------------------------------------------------------------------------------ the headline
@@ -143,8 +151,12 @@ def look_at(run: Path) -> Found:
 def lead(found: Found) -> str:
     """What was trained, on what, and for how long."""
     words = []
-    training = found.training
-    if training is None or not training.get("finished"):
+    training, imported = found.training, read_json(found.run / "imported.json")
+    if imported is not None and found.checkpoint is not None:
+        words.append(
+            f"Imported from {imported.get('source', 'a released checkpoint')}, step {found.checkpoint.step:,}."
+        )
+    elif training is None or not training.get("finished"):
         status = status_of(found.run)
         of = f" of {status.total:,}" if status.total else ""
         words.append(f"Not trained to its end: {status.stage}, step {status.step:,}{of}.")
@@ -311,9 +323,9 @@ def described(result: Result) -> str:
 
 def appearances(found: Found, album: Album) -> tuple[str, list[Block]]:
     """The section of appearances: its intro and its blocks."""
-    if found.checkpoint is None or found.photos is None:
+    model = found.model
+    if model is None or found.photos is None:
         return "", [not_rendered(found)]
-    model = model_of(found.job, found.checkpoint)
     intro = "Each row is one view: as it was photographed, and in the appearances of the photos at the top."
     try:
         return intro if model.spec.appearance != "none" else "", appearance_blocks(model, found.photos, album)
@@ -323,11 +335,10 @@ def appearances(found: Found, album: Album) -> tuple[str, list[Block]]:
 
 def masks(found: Found, album: Album) -> tuple[str, list[Block]]:
     """The section of masks: its intro and its blocks."""
-    if found.checkpoint is None or found.photos is None:
+    if found.model is None or found.photos is None:
         return "", [not_rendered(found)]
-    model = model_of(found.job, found.checkpoint)
     try:
-        blocks = mask_blocks(model, found.photos, album)
+        blocks = mask_blocks(found.model, found.photos, album)
     except (CrossrayError, ValueError) as error:
         return "", [Note(f"No masks could be made: {error}")]
     shows = any(isinstance(block, Sliders) for block in blocks)
@@ -338,7 +349,7 @@ def not_rendered(found: Found) -> Note:
     """Why nothing was rendered for the page."""
     if found.checkpoint is None:
         return Note(f"Nothing to render with: {found.missing['checkpoint']}", shell("run", found.run / "job.yaml"))
-    return Note(f"Nothing could be rendered: {found.missing['photos']}")
+    return Note(f"Nothing could be rendered: {found.missing.get('photos') or found.missing['model']}")
 
 
 # -------------------------------------------------------------------------------------------------------- the tables
@@ -421,6 +432,8 @@ def curve_blocks(found: Found) -> list[Block]:
         *(make_plot(title, [curves[tag]]) for tag, title in one.items() if tag in curves),
     ]
     drawn = [plot for plot in plots if plot is not None]
+    if not drawn and (found.run / "imported.json").is_file():
+        return [Note("An imported checkpoint has no curves.")]
     if not drawn:
         return [Note("No step has been recorded. This trains the run:", shell("run", found.run / "job.yaml"))]
     return [Plots(drawn)]
@@ -467,28 +480,28 @@ def timing_blocks(found: Found) -> list[Block]:
                 text += f"; {result[key]:.3f} s a photo {what}"
         facts.append((f"evaluation, {name}", text))
     blocks: list[Block] = [Facts(facts)] if facts else [Note("No time has been recorded: the training has not ended.")]
-    rows = read_timing(found.run)
+    rows = timings_beside(found.run, found.job.method, found.job.model.field)
     return [*blocks, timing_table(rows)] if rows else blocks
 
 
-def timing_table(rows: list[dict[str, Any]]) -> Table:
-    """Rows of timing.json."""
+def timing_table(rows: list[TimingRow]) -> Table:
+    """What the timing harness measured of this method."""
     titles = ["what", "picture", "appearances", "samples", "seconds", "quartiles", "peak memory, MiB", "on"]
     lines = []
     for row in rows:
-        size = f"{row['width']} × {row['height']}" if row.get("width") else "-"
-        what = ", ".join(str(row[k]) for k in ("table", "method", "how") if row.get(k))
-        seconds, low, high = (row.get(k) for k in ("seconds", "low", "high"))
+        size = f"{row.width} × {row.height}" if row.width else "-"
+        what = f"{row.table}, {row.how}"
+        unit = "an image" if row.unit == "image" else "a step"
         lines.append(
             [
                 Cell(what, what),
-                Cell(size, (row.get("width") or 0) * (row.get("height") or 0)),
-                Cell(str(row.get("appearances", "-")), row.get("appearances")),
-                Cell(" + ".join(map(str, row.get("samples") or [])) or "-"),
-                Cell(f"{seconds:.4g} an {row.get('unit', 'image')}" if seconds is not None else "-", sort_key(seconds)),
-                Cell(f"{low:.4g} to {high:.4g}" if low is not None and high is not None else "-"),
-                Cell(f"{row['peak_memory_MiB']:.0f}" if row.get("peak_memory_MiB") is not None else "-"),
-                Cell(str(row.get("device", "-"))),
+                Cell(size, (row.width or 0) * (row.height or 0)),
+                Cell(str(row.appearances or "-"), row.appearances),
+                Cell(" + ".join(map(str, row.samples))),
+                Cell(f"{row.seconds:.4g} {unit}", row.seconds),
+                Cell(f"{row.low:.4g} to {row.high:.4g}"),
+                Cell("-" if row.peak_memory_MiB is None else f"{row.peak_memory_MiB:.0f}"),
+                Cell(f"{row.device}, {row.precision}"),
             ]
         )
     sortable = [True, True, True, False, True, False, False, False]

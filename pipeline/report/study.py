@@ -22,9 +22,10 @@ from pipeline.report.album import Album
 from pipeline.report.blocks import Block, Cell, Code, Dots, Grid, Note, Page, Section, Shot, Table, write_page
 from pipeline.report.dots import Numbers, make_dots
 from pipeline.report.gallery import spread
-from pipeline.report.recorded import read_json, read_timing
-from pipeline.report.run import as_yaml, read_picture, timing_table
+from pipeline.report.recorded import read_json
+from pipeline.report.run import as_yaml, read_picture
 from pipeline.report.words import count, number, scored, shell, short
+from pipeline.results import Study
 from pipeline.study import Run, StudyJob, expand
 from pipeline.study_tables import Table as StudyTable
 from pipeline.study_tables import captions, make_tables
@@ -61,8 +62,6 @@ def write_study_report(folder: Path, out: Path) -> Path:
         )
     )
     sections.append(Section("runs", "Runs", "", run_blocks(folder, out, runs, results, failures)))
-    if rows := read_timing(folder):
-        sections.append(Section("timing", "Time", "", [timing_table(rows)]))
     record = study.model_dump(mode="json")
     origin: list[Block] = [Code("The study", as_yaml(record)), Code("What made this page", as_yaml(provenance()))]
     sections.append(Section("provenance", "Where it came from", "", origin))
@@ -76,9 +75,11 @@ def read_study(folder: Path) -> tuple[StudyJob, list[Result], dict[str, str]]:
     record = read_json(folder / "study.json")
     try:
         assert record is not None
-        study = StudyJob.model_validate(record["study"])
+        study = Study.model_validate(record).study
+        assert all(isinstance(run["seconds"], int | float) for run in record["runs"])
+        assert all(isinstance(p["mean"], dict) for run in record["runs"] for p in run["protocols"].values())
         return study, list(record["runs"]), dict(record["failures"])
-    except (AssertionError, KeyError, TypeError, ValueError, ValidationError) as error:
+    except (AssertionError, AttributeError, KeyError, TypeError, ValueError, ValidationError) as error:
         raise CrossrayError(
             f"{folder / 'study.json'}: cannot be read ({type(error).__name__}); `crossray run` with the study's job "
             "file writes it anew"
@@ -193,7 +194,7 @@ def truth_lines(
         return []
     indices = {record.key: i for i, record in enumerate(photos.records)}
     lines = [[Shot("photo"), *(photo_shot(photos, indices.get(row["key"]), album) for row in rows)]]
-    if result["protocols"][protocol]["definition"].get("truth") != "clean":
+    if result["protocols"][protocol].get("definition", {}).get("truth") != "clean":
         return lines
     try:
         landmark = truth_of(job, photos)

@@ -29,7 +29,6 @@ from pipeline.timing_inference import (
     chunk_of,
     inference_rows,
     look,
-    precisions,
     settings,
     time_rays,
 )
@@ -46,7 +45,7 @@ from pipeline.timing_job import (
 from pipeline.timing_measure import Meter, PeakMemory, Seconds, counted_flops, peak_flops, resident, summarised
 from pipeline.timing_scene import camera, synthetic_photos, untrained
 from pipeline.timing_table import tables
-from pipeline.timing_training import Steps, note_of, schedule
+from pipeline.timing_training import Steps, note_of, precisions, schedule
 from pipeline.train import uses_bfloat16
 from pipeline.work import Context
 
@@ -117,7 +116,7 @@ def test_times_and_plus():
 
 @pytest.mark.parametrize(("count", "seconds"), [(1, 10.5), (2, 5.5), (64, (10 + 32) / 64)])
 def test_an_image_of_many_is_the_view_once_and_each_look(count, seconds):
-    parts = Parts(Seconds(10, 10, 10, 3), Seconds(0.5, 0.5, 0.5, 3), "recoloured", None, 1.0, None)
+    parts = Parts(Seconds(10, 10, 10, 3), Seconds(0.5, 0.5, 0.5, 3), "recoloured", None, 1.0, None, None)
     assert parts.image(count).median == pytest.approx(seconds)
 
 
@@ -292,7 +291,14 @@ class TestRows:
         assert row.repeats >= 3
         assert min(row.once_seconds, row.each_seconds, row.encode_seconds) > 0
         assert row.seconds == pytest.approx((row.once_seconds + 4 * row.each_seconds) / 4)
-        assert row.extrapolated is None
+        assert row.extrapolated == "2 of the 4 images were made"
+        assert cell(images, "hanerf", 1).extrapolated is None
+
+    def test_what_was_seen_of_one_chunk_alone_is_said(self):
+        one = TimedRays(Seconds(1.0, 1.0, 1.0, 3), 10, 40)
+        parts = Parts(one.of(40), one.of(40), "placed once", None, 0.0, None, one.sentence(40))
+        assert parts.extrapolated(1) == "an image more from 10 of its 40 rays"
+        assert parts.image(1).median == 8
 
     def test_a_single_image_has_its_operations(self, images):
         row = cell(images, "hanerf", 1)
@@ -330,15 +336,16 @@ def test_a_smaller_view_is_not_timed_again_where_less_of_the_larger_was(monkeypa
 
     def timed(meter, setting, rays, reference):
         calls.append(len(rays.near))
-        return inference.Timed(TimedRays(Seconds(1.0, 1.0, 1.0, 3), 10), None, 0.0, None)
+        return inference.Timed(TimedRays(Seconds(1.0, 1.0, 1.0, 3), 10, len(rays.near)), None, 0.0, None)
 
     monkeypatch.setattr(inference, "time_features", timed)
     timing = tiny()
     setting = next(settings(timing, "crossray", CPU))
     found = dict(inference.views(timing, Meter(CPU, 0.001), setting, (8, 4)))
     assert calls == [64]
-    assert found[4].extrapolated == "from 10 of its 64 rays"
-    assert found[8].extrapolated == "from 10 of its 16 rays"
+    assert found[4].extrapolated(1) == "the view from 10 of its 64 rays"
+    assert found[8].extrapolated(1) == "the view from 10 rays of a larger view"
+    assert found[8].extrapolated(64) == "the view from 10 rays of a larger view; 2 of the 64 images were made"
     assert found[4].flops == 0
     calls.clear()
     dict(inference.views(timing, Meter(CPU, 0.001), setting, (16, 8)))
