@@ -1,5 +1,5 @@
 # make quickstart   the whole pipeline on the built-in landmark (about 5 minutes on 2 cores)
-# make test         everything that a machine without a cluster can show
+# make test         everything that a machine without a cluster can show: 8 minutes on 2 cores
 # make check        the fast part, for every commit
 # make test-cluster clusters of several nodes on this machine, and nodes that are lost: under 30 minutes
 # make test-nerfbaselines the method for nerfbaselines, in an environment of its own (it takes numpy below 2): 3 minutes
@@ -14,7 +14,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BASELINES := .venv-nerfbaselines
 
-.PHONY: install quickstart test test-cluster test-nerfbaselines soak check check-a-m check-n-z lint format clean
+.PHONY: install quickstart check check-a-m check-n-z test test-a-m test-n-z test-cluster test-nerfbaselines soak lint
+.PHONY: format clean
 
 install: $(STAMP)
 
@@ -28,17 +29,27 @@ $(STAMP): pyproject.toml constraints.txt
 quickstart: install
 	$(BIN)/crossray quickstart
 
-check: install
-	@OMP_NUM_THREADS=1 $(MAKE) --no-print-directory --jobs=2 --output-sync check-a-m check-n-z lint
+# Both keep two processes busy the whole time: the files of tests/pipeline are cut in the middle of the alphabet.
+TWICE = @OMP_NUM_THREADS=1 $(MAKE) --no-print-directory --jobs=2 --output-sync
+TEST = $(BIN)/python -m pytest -q -m
 
-# Two processes are busy the whole time: the files of tests/pipeline are cut in the middle of the alphabet.
-check-a-m: CHECKED = tests/model tests/pipeline/test_[a-m]*.py
-check-n-z: CHECKED = tests/pipeline/test_[n-z]*.py
-check-a-m check-n-z: install
-	$(BIN)/python -m pytest -q -m "not slow and not real and not cluster" $(CHECKED)
+check: install
+	$(TWICE) check-a-m check-n-z lint
 
 test: install
-	$(BIN)/python -m pytest -q -m "not cluster"
+	$(TWICE) test-a-m test-n-z
+
+check-a-m: install
+	$(TEST) "not slow and not real and not cluster" tests/model tests/pipeline/test_[a-m]*.py
+
+check-n-z: install
+	$(TEST) "not slow and not real and not cluster" tests/pipeline/test_[n-z]*.py
+
+test-a-m: install
+	$(TEST) "not cluster" tests/model tests/faults tests/nerfbaselines tests/pipeline/test_[a-m]*.py
+
+test-n-z: install
+	$(TEST) "not cluster" tests/pipeline/test_[n-z]*.py
 
 test-cluster: install
 	$(BIN)/python -m pytest -q -m cluster

@@ -27,7 +27,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from model.bake import Baked, bake
 from model.fields.base import Rays
+from model.scene_model import SceneModel
 from pipeline.files import atomic_write
 from pipeline.provenance import provenance
 from pipeline.render import View, recoloured, statistics_of, view_rays
@@ -36,6 +38,7 @@ from pipeline.timing_job import TimingJob, make_timing
 from pipeline.timing_measure import Meter, Seconds
 from pipeline.timing_scene import camera, reference_photo
 
+CPU = torch.device("cpu")
 SIDE = 256  # pixels
 APPEARANCES = 64
 ROUNDS = 3  # in which the presets take turns
@@ -47,6 +50,7 @@ class Measured(NamedTuple):
 
     setting: Setting
     rendered: list[float]  # seconds of the whole view, one a round
+    baked: list[float]  # the same rays with an appearance folded into the field
     rays: int  # that were rendered; fewer than the view's: extrapolated
     statistics: Seconds  # once a view
     mapped: Seconds  # one appearance's A and b
@@ -70,9 +74,16 @@ class Measured(NamedTuple):
         return (self.render + self.statistics.median + self.many.median) / APPEARANCES
 
 
-def rendering(setting: Setting, rays: Rays) -> Tensor:
-    """Features of rays."""
-    return setting.model.render(rays, samples=setting.samples).features
+def rendering(setting: Setting, model: SceneModel | Baked, rays: Rays) -> Tensor:
+    """Features of rays; of a baked model their colours."""
+    return model.render(rays, samples=setting.samples).features
+
+
+def baked_of(timing: TimingJob, setting: Setting) -> Baked:
+    """The model with one appearance in its field."""
+    model, features = setting.model, torch.rand(1024, setting.job.model.channels)
+    view = View((32, 32), features, torch.empty(0), torch.empty(0))
+    return bake(model, model.colour_map(statistics_of(model, view), model.encode([reference_photo(timing, CPU)])))
 
 
 def rays_of(timing: TimingJob, setting: Setting, meter: Meter) -> Rays:
@@ -80,8 +91,8 @@ def rays_of(timing: TimingJob, setting: Setting, meter: Meter) -> Rays:
     view = view_rays(camera(0, SIDE, SIDE), setting.model.spec.pixel_center, meter.device)
     chunk = chunk_of(setting)
     some = first(view, chunk)
-    rendering(setting, some)  # warm
-    seconds = meter.once(lambda: rendering(setting, some))
+    rendering(setting, setting.model, some)  # warm
+    seconds = meter.once(lambda: rendering(setting, setting.model, some))
     return first(view, chunk * max(1, int(timing.seconds / seconds)))
 
 
@@ -90,11 +101,14 @@ def measure(timing: TimingJob, meter: Meter) -> dict[str, Measured]:
     """Both presets, in turns."""
     chosen = {name: next(settings(timing, name, meter.device)) for name in ("crnerf", "crossray")}
     rays = {name: rays_of(timing, setting, meter) for name, setting in chosen.items()}
-    rendered: dict[str, list[float]] = {name: [] for name in chosen}
+    baked = {name: baked_of(timing, setting) for name, setting in chosen.items()}
+    rendered: dict[tuple[str, bool], list[float]] = {(name, folded): [] for name in chosen for folded in (False, True)}
     for _ in range(ROUNDS):
-        for name, setting in chosen.items():
-            seconds = meter.once(lambda s=setting, r=rays[name]: rendering(s, r))
-            rendered[name].append(seconds * SIDE**2 / len(rays[name].near))
+        for name, folded in rendered:
+            setting, some = chosen[name], rays[name]
+            model = baked[name] if folded else setting.model
+            seconds = meter.once(lambda s=setting, m=model, r=some: rendering(s, m, r))
+            rendered[name, folded].append(seconds * SIDE**2 / len(some.near))
     found = {}
     for name, setting in chosen.items():
         model, reference = setting.model, reference_photo(timing, meter.device)
@@ -104,7 +118,8 @@ def measure(timing: TimingJob, meter: Meter) -> dict[str, Measured]:
         all_of_them = one.expand(APPEARANCES, -1, -1, -1)
         found[name] = Measured(
             setting,
-            rendered[name],
+            rendered[name, False],
+            rendered[name, True],
             len(rays[name].near),
             meter.measure(lambda m=model, v=view: statistics_of(m, v)),
             meter.measure(lambda m=model, c=content, a=one: m.colour_map(c, a)),
@@ -142,6 +157,7 @@ def as_record(measured: Measured) -> dict[str, Any]:
     return {
         "samples": list(measured.setting.samples),
         "rendered": {"median": measured.render, "rounds": measured.rendered},
+        "baked": {"median": statistics.median(measured.baked), "rounds": measured.baked},
         "rays_timed": measured.rays,
         "rays": SIDE**2,
         "statistics": measured.statistics._asdict(),
@@ -162,15 +178,25 @@ def main() -> None:
     options = parser.parse_args()
     where = provenance()
     torch.set_num_threads(1)
-    meter = Meter(torch.device("cpu"), options.seconds)
+    meter = Meter(CPU, options.seconds)
     timing = make_timing({"threads": 1, "device": "cpu", "precision": ["float32"], "seconds": options.seconds})
     found = measure(timing, meter)
-    columns = ("view", "rays timed", "statistics", "map", "re-coloured", "64 with maps", "reading one appearance")
+    columns = (
+        "view",
+        "view, baked",
+        "rays timed",
+        "statistics",
+        "map",
+        "re-coloured",
+        "64 with maps",
+        "reading one appearance",
+    )
     print(f"| preset | {' | '.join(columns)} |\n|{'---|' * (1 + len(columns))}")
     for name, m in found.items():
         times = (m.statistics, m.mapped, m.single, m.many, m.encoded)
         milliseconds = " | ".join(f"{1e3 * t.median:.2f} ms" for t in times)
-        print(f"| {name} | {m.render:.3g} s | {m.rays:,} of {SIDE**2:,} | {milliseconds} |")
+        baked = statistics.median(m.baked)
+        print(f"| {name} | {m.render:.3g} s | {baked:.3g} s | {m.rays:,} of {SIDE**2:,} | {milliseconds} |")
     print("\n| bar | measured | wanted | |\n|---|---|---|---|")
     table = bars(found)
     for row in table:

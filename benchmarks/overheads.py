@@ -20,11 +20,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from scores import machine
-
 from pipeline.checkpoint import committed
 from pipeline.config import Job, make_job
+from pipeline.files import atomic_write
 from pipeline.heartbeat import rank_path, read_beat
+from pipeline.provenance import provenance
 
 STEPS = 400
 
@@ -162,7 +162,7 @@ def main() -> None:
         finish(crossray("pipeline", "shard", "scene", "--out", "shards/scene-R1", "--downscale", "1",
                         "--reference-downscale", "1", cwd=folder), folder)  # fmt: skip
         found = {
-            "machine": machine(),
+            "provenance": provenance(),
             "seconds_to_the_first_step": starts(folder),
             "seconds_from_a_kill_to_the_next_step": restarts(folder),
             "checkpoints": checkpoints(folder),
@@ -178,7 +178,7 @@ def main() -> None:
         )
     print("ms a step: " + ", ".join(f"{k} {1e3 * v:.1f}" for k, v in found["seconds_a_step_beside_evaluation"].items()))
     if options.out:
-        options.out.write_text(json.dumps(found, indent=2) + "\n")
+        atomic_write(options.out, json.dumps(found, indent=2) + "\n")
 
 
 if __name__ == "__main__":

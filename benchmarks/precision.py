@@ -14,11 +14,12 @@ import time
 from pathlib import Path
 
 import torch
-from scores import machine
 
 from model.fields.base import Rays
 from model.scene_model import Batch, SceneModel
 from pipeline.config import make_job
+from pipeline.files import atomic_write
+from pipeline.provenance import provenance
 
 METHODS = ("crnerf", "crossray")
 
@@ -79,8 +80,8 @@ def main() -> None:
             print(f"| {method} | {name} | {middle:.3f} | {min(times):.3f} | {max(times):.3f} |", flush=True)
     if options.out:
         device_label = torch.cuda.get_device_name() if device.type == "cuda" else "cpu"
-        record = {"machine": machine(), "device": device_label, "threads": options.threads, "rows": rows}
-        options.out.write_text(json.dumps(record, indent=1) + "\n")
+        record = {"provenance": provenance(), "device": device_label, "threads": options.threads, "rows": rows}
+        atomic_write(options.out, json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -16,14 +16,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-import subprocess
 from pathlib import Path
 
 import numpy as np
-import psutil
-import torch
+
+from pipeline.files import atomic_write
+from pipeline.provenance import provenance
 
 PROTOCOLS = ("crnerf-full@R8", "nerfw-half@R8")
 
@@ -36,19 +34,6 @@ def scores_of(run: Path) -> dict:
         images = {row["name"]: {k: row[k] for k in ("psnr", "ssim", "lpips") if k in row} for row in metrics["images"]}
         evaluations[folder.name] = {"mean": metrics["mean"], "images": images, "versions": metrics["versions"]}
     return {"training": json.loads((run / "training.json").read_text()), "evaluations": evaluations}
-
-
-def machine() -> dict:
-    """What the numbers were measured on."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-    return {
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "memory_GiB": round(psutil.virtual_memory().total / 2**30, 1),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "commit": commit.stdout.strip(),
-    }
 
 
 def table(quick: dict, ours: dict, nerf: dict) -> list[str]:
@@ -86,8 +71,8 @@ def main() -> None:
     options = parser.parse_args()
     quick = json.loads((options.quickstart / "summary.json").read_text())
     ours, nerf = scores_of(options.crossray), scores_of(options.nerf)
-    record = {"machine": machine(), "quickstart": quick, "reichstag": {"crossray": ours, "nerf": nerf}}
-    options.out.write_text(json.dumps(record, indent=1) + "\n")
+    record = {"provenance": provenance(), "quickstart": quick, "reichstag": {"crossray": ours, "nerf": nerf}}
+    atomic_write(options.out, json.dumps(record, indent=1) + "\n")
     print("\n".join(table(quick, ours, nerf)))
     gains = [
         row["psnr"] - nerf["evaluations"][PROTOCOLS[0]]["images"][name]["psnr"]

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from model.appearance.crossray import ContentStatistics
 from model.bake import Baked, bake, blank, check_bakeable
-from model.methods import ModelSpec, smallest_side
+from model.methods import ModelSpec
 from model.scene_model import SceneModel
 from pipeline.board import PICTURE_SIDE
 from pipeline.checkpoint import MODEL, digest
@@ -39,7 +39,14 @@ from pipeline.files import atomic_file, atomic_write, sha256_of
 from pipeline.metrics import to_8bit
 from pipeline.photos import Photos
 from pipeline.provenance import provenance
-from pipeline.render import grid_statistics, interpolated, read_appearance, render_baked, statistics_of
+from pipeline.render import (
+    check_reference,
+    grid_statistics,
+    interpolated,
+    read_appearance,
+    render_baked,
+    statistics_of,
+)
 from pipeline.runs import load_run, photos_of
 from pipeline.shards import ShardError, to_rgb
 from pipeline.truth import reduced
@@ -159,13 +166,7 @@ def find_appearance(model: SceneModel, photos: Photos, name: str) -> Read:
         close = difflib.get_close_matches(name, records, n=1, cutoff=0.5)
         guess = f"; did you mean {close[0]!r}?" if close else f" (the first is {photos.records[0].name!r})"
         raise CrossrayError(f"{name}: neither an image file nor the name of a photo of the scene{guess}")
-    least, (height, width) = smallest_side(model.spec), picture.shape[:2]
-    if min(height, width) < least:
-        factor = photos.manifest.reference_downscale
-        raise CrossrayError(
-            f"{name}: as a reference, at 1/{factor} of its size, it has {width} x {height} "
-            f"pixels, and model.encoder: released reads no side under {least}; take a larger picture"
-        )
+    check_reference(model.spec, picture, name)
     F = read_appearance(model, picture)
     return Read(torch.empty(0) if F is None else F, {"photo": Path(name).name, "sha256": sha256})
 

@@ -52,10 +52,9 @@ class Pool:
         self.rows, self.cols = pixels // columns, pixels % columns
         self.colours = torch.from_numpy(np.array(image[:, :columns])).to(device)[self.rows, self.cols].float() / 255
 
-    def draw(self, count: int) -> Tensor:
-        """Numbers (count,) of some pixels, each as likely as any other."""
-        drawn = torch.randint(len(self.rows), (count,), generator=self.generator)
-        return drawn.to(self.rows.device)
+    def draws(self, steps: int, count: int) -> Tensor:
+        """Numbers (steps, count) of some pixels, each as likely as any other: of all steps at once, for one copy."""
+        return torch.randint(len(self.rows), (steps, count), generator=self.generator).to(self.rows.device)
 
 
 def fit_code(
@@ -127,8 +126,7 @@ def descend(moved: Sequence[Tensor], picture: Callable[[Tensor], Tensor], pool: 
     """Move what is `moved` so that `picture`, rgb (R, 3) of pixels (R,) of the pool, comes close to their colours."""
     optimiser = torch.optim.Adam(moved, lr=recipe.learning_rate)
     schedule = torch.optim.lr_scheduler.StepLR(optimiser, max(1, recipe.steps // recipe.stages), gamma=0.1)
-    for _ in range(recipe.steps):
-        drawn = pool.draw(recipe.rays)
+    for drawn in pool.draws(recipe.steps, recipe.rays):
         loss = (picture(drawn) - pool.colours[drawn]).square().mean()
         for tensor, gradient in zip(moved, torch.autograd.grad(loss, moved), strict=True):
             tensor.grad = gradient

@@ -12,21 +12,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from model.methods import smallest_side
 from model.scene_model import SceneModel
 from pipeline.errors import CrossrayError
 from pipeline.fit import FitRecipe, fit_code, fit_map
 from pipeline.landmark import Landmark
-from pipeline.lpips import LPIPS, VARIABLE, find_lpips, read_lpips
+from pipeline.lpips import LPIPS, SMALLEST_SIDE, VARIABLE, find_lpips, read_lpips
 from pipeline.metrics import psnr, ssim_11, ssim_window3
 from pipeline.photos import Photos
 from pipeline.protocol import Protocol, appearance_from, samples_of
-from pipeline.render import View, colour_view, read_appearance, render_view
+from pipeline.render import View, check_reference, colour_view, read_appearance, render_view
 from pipeline.truth import elsewhere, mask_iou, reduced
 
 log = logging.getLogger("crossray")
 
-LPIPS_SIDE = 31  # pixels; AlexNet has nothing left of a smaller picture
 MASK_PHOTOS = 32  # training photos over which masks are compared with the truth, at most
 
 
@@ -145,7 +143,7 @@ class Judge:
         seen = self.seen(index)
         if self.model.embedding is not None:
             return self.learned_code(seen, index)
-        self.check_reference(seen.reference, index)
+        check_reference(self.model.spec, seen.reference, self.photos.records[index].name)
         began = self.now()
         appearance = read_appearance(self.model, seen.reference)
         self.check_numbers(appearance, "the appearance that is read for it", index)
@@ -181,16 +179,6 @@ class Judge:
             raise CrossrayError(
                 f"{self.photos.records[index].name}: {bad} of {values.numel()} numbers of {what} are NaN, so nothing "
                 "can be scored; an earlier checkpoint may do (--step)"
-            )
-
-    def check_reference(self, reference: np.ndarray, index: int) -> None:
-        """CrossrayError where what may be seen of a photo is too small for the appearance network."""
-        least, (height, width) = smallest_side(self.model.spec), reference.shape[:2]
-        if min(height, width) < least:
-            raise CrossrayError(
-                f"{self.photos.records[index].name}: {width} x {height} pixels of its reference may be read "
-                f"({self.appearance_from}), and model.encoder: released reads no side under {least}; cut the shards "
-                "with a smaller scene.reference_downscale"
             )
 
     def clean(self, view: int, light: int) -> np.ndarray:
@@ -231,8 +219,8 @@ def lpips_usable(photos: Photos, indices: tuple[int, ...], protocol: Protocol) -
         return False
     for record in (photos.records[i] for i in indices):
         width = record.width - first_scored(record.width, protocol)
-        if min(record.height, width) < LPIPS_SIDE:
-            warn_once(f"LPIPS is left out: what is scored of {record.name} has a side under {LPIPS_SIDE} pixels")
+        if min(record.height, width) < SMALLEST_SIDE:
+            warn_once(f"LPIPS is left out: what is scored of {record.name} has a side under {SMALLEST_SIDE} pixels")
             return False
     return True
 

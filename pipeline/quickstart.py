@@ -39,6 +39,7 @@ log = logging.getLogger("crossray")
 TRAIN_SECONDS = 100.0
 SIZE = 128  # long side of a photo, pixels
 PHOTOS = {"train": 144, "val": 8, "test": 8}
+TITLE = "The landmark without its tourists"
 SCORES = {
     "psnr": "test views in their own light, against the truth without tourists [dB]",
     "psnr_cross": "the same, the light read from another view [dB]",
@@ -221,13 +222,21 @@ class Scored:
 
 def report_of(summary: dict[str, Any], rows: list[Row], path: Path) -> Path:
     """The page of the quick start; returns its path."""
-    scores = [(key, "-" if summary[key] is None else f"{summary[key]:.3f}", text) for key, text in SCORES.items()]
-    lead = (
+    return write_report(path, TITLE, scores_of(summary), rows, lead_of(summary))
+
+
+def scores_of(summary: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Key, value and meaning of each score."""
+    return [(key, "-" if summary[key] is None else f"{summary[key]:.3f}", text) for key, text in SCORES.items()]
+
+
+def lead_of(summary: dict[str, Any]) -> str:
+    """What was trained, on what, and for how long."""
+    return (
         f"{summary['train_steps']:,} steps of {summary['photos']['train']} photos on {summary['device']}, "
         f"{count(summary['ranks'], 'process', 'processes')}, and plain NeRF beside it with the same field and the same "
         "seconds."
     )
-    return write_report(path, "The landmark without its tourists", scores, rows, lead)
 
 
 def report_again(out: Path, path: Path) -> Path:
@@ -239,12 +248,13 @@ def report_again(out: Path, path: Path) -> Path:
     try:
         summary = json.loads((out / "summary.json").read_text())
         ours, nerf = (quickstart_job(out, m, summary["ranks"], summary["train_seconds"]) for m in ("crossray", "nerf"))
-        return report_of(summary, Scored(out, ours, nerf).rows(), path)
+        scores, lead = scores_of(summary), lead_of(summary)
     except (ValueError, KeyError, TypeError) as error:
         raise CrossrayError(
             f"{out / 'summary.json'}: is not what the quick start writes ({type(error).__name__}: {error}); "
             f"`crossray quickstart --out {out}` writes it anew"
         ) from None
+    return write_report(path, TITLE, scores, Scored(out, ours, nerf).rows(), lead)
 
 
 def print_summary(console: Console, out: Path, summary: dict[str, Any], report: Path) -> None:

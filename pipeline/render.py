@@ -17,7 +17,7 @@ from model.appearance.crossray import ContentStatistics
 from model.bake import Baked
 from model.cameras import patch_grid, pixel_rays
 from model.fields.base import Rays
-from model.methods import StatisticsPolicy
+from model.methods import ModelSpec, StatisticsPolicy, smallest_side
 from model.scene_model import ColourMap, SceneModel
 from pipeline.batches import as_tensor
 from pipeline.errors import CrossrayError
@@ -25,7 +25,8 @@ from pipeline.photos import Photos
 from pipeline.shards import CameraRecord
 
 STATISTICS_SIDE = 32  # rays a side of the grid whose points give the statistics of appearance that is fused at points
-RECOLOURED = 2**18  # colour values that are computed at once when a view is re-coloured: 1 MiB, what a core caches
+# Colour values that are computed at once when a view is re-coloured: 1 MiB, as a core caches; on a GPU, few launches.
+RECOLOURED = {"cpu": 2**18, "cuda": 2**25}
 
 
 class View(NamedTuple):
@@ -52,6 +53,13 @@ def view_rays(camera: CameraRecord, pixel_center: float, device: torch.device, s
     return Rays(origins, directions, origins.new_full((count,), camera.near), origins.new_full((count,), camera.far))
 
 
+def grid_rays(rays: Rays, size: tuple[int, int]) -> Rays:
+    """STATISTICS_SIDE^2 of a view's rays, on a grid that spans it."""
+    rows, cols, _ = patch_grid(STATISTICS_SIDE, 1.0, 0.0, 0.0, *size)
+    chosen = (rows * size[1] + cols).to(rays.near.device)
+    return Rays(*(r[chosen] for r in rays))
+
+
 def render_view(
     model: SceneModel,
     camera: CameraRecord,
@@ -73,10 +81,19 @@ def render_view(
     size = (len(range(stride // 2, camera.height, stride)), len(range(stride // 2, camera.width, stride)))
     points = None
     if model.transform is not None and model.spec.fused == "point":
-        rows, cols, _ = patch_grid(STATISTICS_SIDE, 1.0, 0.0, 0.0, *size)
-        chosen = (rows * size[1] + cols).to(device)
-        points = model.point_features(Rays(*(r[chosen] for r in rays)), samples)
+        points = model.point_features(grid_rays(rays, size), samples)
     return View(size, rendering.features, rendering.depth.view(size), rendering.accumulation.view(size), points)
+
+
+def check_reference(spec: ModelSpec, reference: np.ndarray, whose: str) -> None:
+    """CrossrayError where a photo (h, w, 3) is too small for the network that reads its appearance; `whose` it is."""
+    least, (height, width) = smallest_side(spec), reference.shape[:2]
+    if min(height, width) < least:
+        raise CrossrayError(
+            f"{whose}: {width} x {height} pixels of it are read for its appearance, at the shards' "
+            f"scene.reference_downscale, and model.encoder: {spec.encoder} reads no side under {least}; take a larger "
+            "photo, or cut the shards with a smaller scene.reference_downscale"
+        )
 
 
 @torch.no_grad()
@@ -139,9 +156,8 @@ def grid_statistics(model: SceneModel, camera: CameraRecord) -> ContentStatistic
     """
     if model.transform is None:
         raise ValueError("a model without a transform takes no statistics")
-    rows, cols, _ = patch_grid(STATISTICS_SIDE, 1.0, 0.0, 0.0, camera.height, camera.width)
-    chosen = (rows * camera.width + cols).to(next(model.parameters()).device)
-    rays = Rays(*(r[chosen] for r in view_rays(camera, model.spec.pixel_center, chosen.device)))
+    device = next(model.parameters()).device
+    rays = grid_rays(view_rays(camera, model.spec.pixel_center, device), (camera.height, camera.width))
     seen = model.point_features(rays) if model.fuses_points else model.render(rays).features
     return model.transform.content_statistics(seen[None])
 
@@ -177,7 +193,7 @@ def recoloured(view: View, colours: ColourMap, rounding: Literal["truncate", "ro
     half = 0.5 if rounding == "round" else 0.0
     weight, bias = A.flatten(0, 1).T, b.flatten()  # as it lies in memory: products are 3 times as fast as copied
     pictures = torch.empty(len(A), height * width, 3, dtype=torch.uint8, device=A.device)
-    block = max(1, RECOLOURED // weight.shape[1])
+    block = max(1, RECOLOURED[A.device.type] // weight.shape[1])
     check = A.new_zeros(())  # NaN as soon as one value is
     for start in range(0, height * width, block):
         values = (view.features[start : start + block] @ weight).add_(bias)

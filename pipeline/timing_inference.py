@@ -23,12 +23,11 @@ import torch
 from torch import Tensor
 
 from model.appearance.crossray import ContentStatistics
-from model.cameras import patch_grid
 from model.fields.base import RENDER_POINTS, Codes, Placed, Rays, at_least_float32
 from model.scene_model import SceneModel
 from pipeline.config import Job
 from pipeline.provenance import device_name
-from pipeline.render import STATISTICS_SIDE, View, recoloured, statistics_of, view_rays
+from pipeline.render import View, grid_rays, recoloured, statistics_of, view_rays
 from pipeline.timing import TimingRow
 from pipeline.timing_job import TimingJob, method_job, threads_of
 from pipeline.timing_measure import LEAST, Meter, PeakMemory, Seconds, counted_flops, memory_of
@@ -329,13 +328,6 @@ def flops_a_ray(work: Callable[[Rays], object], rays: Rays) -> float:
 def first(rays: Rays, count: int) -> Rays:
     """The first `count` of the rays."""
     return Rays(*(r[:count] for r in rays))
-
-
-def grid_rays(rays: Rays, size: tuple[int, int]) -> Rays:
-    """Those of a view's rays whose points give the statistics of appearance that is fused at points."""
-    rows, cols, _ = patch_grid(STATISTICS_SIDE, 1.0, 0.0, 0.0, *size)
-    chosen = (rows * size[1] + cols).to(rays.near.device)
-    return Rays(*(r[chosen] for r in rays))
 
 
 def eight_bit(colours: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.methods import CODE, smallest_reference, smallest_side
+from model.methods import CODE, smallest_reference
 from model.scene_model import SceneModel
 from pipeline.batches import TrainingPhotos, check_references
 from pipeline.clock import Clock
@@ -32,7 +32,7 @@ from pipeline.nerfbaselines.dataset import DatasetPhotos, numbers, picture_of, w
 from pipeline.nerfbaselines.saved import KnownScene, Saved, load_moments, read_saved, write_saved
 from pipeline.protocol import Protocol, parse_protocol, samples_of
 from pipeline.record import LossRecord, record_path
-from pipeline.render import read_appearance, render_picture, render_view
+from pipeline.render import check_reference, read_appearance, render_picture, render_view
 from pipeline.resume import run_identity
 from pipeline.scene import SceneError, camera_to_world, depth_bounds
 from pipeline.shards import CameraRecord
@@ -231,13 +231,7 @@ class Crossray:
 
     def read(self, reference: np.ndarray) -> Tensor:
         """F^a of a reference, by the encoder."""
-        least, (height, width) = smallest_side(self.job.model), reference.shape[:2]
-        if min(height, width) < least:
-            raise CrossrayError(
-                f"a photo to read the appearance from is {width} x {height} pixels after scene.reference_downscale: "
-                f"{self.job.scene.reference_downscale}, and the released encoder reads no side under {least}; train "
-                "with a smaller factor"
-            )
+        check_reference(self.job.model, reference, "a photo")
         appearance = read_appearance(self.model, reference)
         assert appearance is not None
         return appearance

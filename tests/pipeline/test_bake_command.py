@@ -259,7 +259,7 @@ def test_wrong_input_is_one_message(crossray, run, tmp_path):
 
 def test_a_photo_that_the_encoder_cannot_read_is_refused(photos, tmp_path):
     model = SceneModel(ModelSpec(mlp=MLPSpec(width=8)), torch.zeros(2, 3))
-    with pytest.raises(CrossrayError, match=r"small.png: as a reference, at 1/1 .* it has 7 x 40 pixels"):
+    with pytest.raises(CrossrayError, match=r"small.png: 7 x 40 pixels of it are read for its appearance"):
         find_appearance(model, photos, str(picture_file(tmp_path / "small.png", (7, 40))))
 
 

@@ -275,7 +275,7 @@ def test_blocks_do_not_change_a_picture(monkeypatch):
     view, colours = random_view(), random_colours(5)
     whole = recoloured(view, colours)
     for values in (1, 100, 10**9):  # one pixel at once; 6 pixels; all
-        monkeypatch.setattr(module, "RECOLOURED", values)
+        monkeypatch.setattr(module, "RECOLOURED", {"cpu": values})
         for a, b in zip(recoloured(view, colours), whole, strict=True):
             assert np.abs(a.astype(int) - b).max() <= 1
             assert (a != b).mean() < 0.01
