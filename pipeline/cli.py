@@ -343,7 +343,7 @@ def bake(
     out: Annotated[Path | None, typer.Option(help="Folder for it; by default RUN/baked/<photo>.")] = None,
     step: Annotated[int | None, typer.Option(help="Checkpoint to bake; the newest by default.")] = None,
 ) -> None:
-    """Fold an appearance into a trained field: the same pictures, faster, without the appearance networks."""
+    """Fold an appearance into a trained field: the same pictures without the appearance networks."""
     from pipeline.bake import bake_run
 
     folder = bake_run(run, appearance, towards, share, out, step)
