@@ -38,7 +38,7 @@ def provenance() -> dict[str, Any]:
 
 
 def command() -> str:
-    """The command line of this process, as a shell takes it."""
+    """The command line of this process, as a shell takes it in its folder: paths below that are relative."""
     program, words = Path(sys.argv[0]), sys.argv[1:]
     if program.name == "__main__.py":
         start = ["python", "-m", program.parent.name]
@@ -46,7 +46,8 @@ def command() -> str:
         start = ["python", str(Path(program.parent.name, program.name))]
     else:
         start = [program.name]
-    return shlex.join([*start, *words])
+    below = f"{Path.cwd()}{os.sep}"
+    return shlex.join(word.replace(below, "") for word in [*start, *words])
 
 
 @cache

@@ -36,6 +36,13 @@ def test_the_command_can_be_given_to_a_shell_again(monkeypatch) -> None:
     assert command() == "python benchmarks/race.py --minutes 1"
 
 
+def test_a_command_tells_nothing_of_where_its_folder_is(monkeypatch, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = [f"{tmp_path}/runs/a/job.yaml", "--set", f"runs={tmp_path}/b", "/elsewhere/c"]
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/crossray", "run", *words])
+    assert command() == "crossray run runs/a/job.yaml --set runs=b /elsewhere/c"
+
+
 def test_the_commit_is_that_of_the_checkout() -> None:
     head = subprocess.run(["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     if head.returncode != 0:
