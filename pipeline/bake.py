@@ -36,8 +36,10 @@ from pipeline.board import PICTURE_SIDE
 from pipeline.checkpoint import MODEL, digest
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write, sha256_of
+from pipeline.manifest import ShardError
 from pipeline.metrics import to_8bit
 from pipeline.photos import Photos
+from pipeline.pictures import to_rgb
 from pipeline.provenance import provenance
 from pipeline.render import (
     check_reference,
@@ -48,7 +50,6 @@ from pipeline.render import (
     statistics_of,
 )
 from pipeline.runs import load_run, photos_of
-from pipeline.shards import ShardError, to_rgb
 from pipeline.truth import reduced
 
 FORMAT = 1

@@ -227,10 +227,10 @@ def shard(
     from pydantic import ValidationError
 
     from pipeline.config import explain, merge, parse_setting
+    from pipeline.cutting import cut_shards
     from pipeline.launch.tasks import ray_tasks
     from pipeline.patches import PatchPlan
     from pipeline.progress import shown
-    from pipeline.shards import cut_shards
 
     chosen: dict = {}
     for setting in settings:

@@ -20,9 +20,9 @@ from model.appearance.crossray import recolour
 from model.cameras import pixel_rays
 from model.fields.base import Rays
 from model.scene_model import SceneModel
+from pipeline.manifest import CameraRecord
 from pipeline.patches import step_generator
 from pipeline.render import View, statistics_of
-from pipeline.shards import CameraRecord
 
 
 class FitRecipe(BaseModel):

@@ -27,9 +27,9 @@ from pipeline.landmark import Landmark
 from pipeline.landmark.collection import look
 from pipeline.landmark.photo import depth_map, photograph
 from pipeline.landmark.tracer import Pinhole
+from pipeline.manifest import CameraRecord
 from pipeline.photos import Photos
 from pipeline.render import View, read_appearance, render_view, view_colours
-from pipeline.shards import CameraRecord
 
 SPREAD = 40  # degrees to each side that the path goes
 SAME_SURFACE = 0.02  # share of the depth: farther apart, two points are not the same

@@ -1,7 +1,7 @@
 """Fixed masks: one transient-probability PNG a photo, from a segmenter that has never seen the scene.
 
 `SCENE/masks/<photo name with suffix .png>` is uint8, 255 = certainly transient, with the photo's aspect and at most
-its size; cutting shards takes it from there (`pipeline.shards.mask_path`), and `model.transient: fixed` trains with
+its size; cutting shards takes it from there (`pipeline.cutting.mask_path`), and `model.transient: fixed` trains with
 it. Which things count as transient: `pipeline/segmentation/classes.py`.
 
 Every mask carries a `MaskRecord` as a PNG text: what it was made from, and what its pixels were. So an interrupted
@@ -27,9 +27,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write, sha256_of
+from pipeline.manifest import ShardError
+from pipeline.pictures import decode_photo
 from pipeline.scene import Scene, ScenePhoto, read_scene
 from pipeline.segmentation import Segmenter, SegmenterRecord
-from pipeline.shards import ShardError, decode_photo
 
 RECORD = "masks.json"
 TEXT = "crossray"  # keyword of the PNG text that holds a MaskRecord

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write
-from pipeline.shards import CameraRecord, Manifest, check_sha256, check_sizes, read_manifest, read_shard
+from pipeline.manifest import CameraRecord, Manifest, read_manifest
+from pipeline.shards import check_sha256, check_sizes, read_shard
 
 
 class CacheError(CrossrayError):

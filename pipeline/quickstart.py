@@ -20,6 +20,7 @@ from rich.table import Table
 
 from model.scene_model import SceneModel
 from pipeline.config import Job, make_job, save_job
+from pipeline.cutting import cut_shards
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.judge import depth_picture
@@ -31,7 +32,6 @@ from pipeline.render import View, colour_view, predicted_mask, read_appearance, 
 from pipeline.report import Row, write_overview, write_report
 from pipeline.report.words import count
 from pipeline.runs import load_run
-from pipeline.shards import cut_shards
 from pipeline.truth import mask_iou
 
 log = logging.getLogger("crossray")

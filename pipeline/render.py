@@ -21,8 +21,8 @@ from model.methods import ModelSpec, StatisticsPolicy, smallest_side
 from model.scene_model import ColourMap, SceneModel
 from pipeline.batches import as_tensor
 from pipeline.errors import CrossrayError
+from pipeline.manifest import CameraRecord
 from pipeline.photos import Photos
-from pipeline.shards import CameraRecord
 
 STATISTICS_SIDE = 32  # rays a side of the grid whose points give the statistics of appearance that is fused at points
 # Colour values that are computed at once when a view is re-coloured: 1 MiB, as a core caches; on a GPU, few launches.

@@ -35,9 +35,9 @@ from pipeline.config import (
     parse_yaml,
 )
 from pipeline.evaluate import recorded
+from pipeline.manifest import MANIFEST, read_manifest
 from pipeline.published import published_tables
 from pipeline.resume import checkpoints
-from pipeline.shards import MANIFEST, read_manifest
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=40)]
 Seeds = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from model.scene_model import SceneModel
 from pipeline.config import Job
+from pipeline.manifest import CameraRecord, Manifest, PlanRecord, SceneRecord
 from pipeline.patches import PatchPlan
 from pipeline.photos import CachedPhoto, CacheIndex, Photos, Picture
-from pipeline.shards import CameraRecord, Manifest, PlanRecord, SceneRecord
 from pipeline.timing_job import TimingJob
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

@@ -12,6 +12,7 @@ import yaml
 from filelock import FileLock
 
 from pipeline.config import BOOKKEEPING, Job, flatten, save_job
+from pipeline.cutting import cut_shards, mask_path, masks_hash, scene_record
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import run_protocols
 from pipeline.heartbeat import Heartbeat, driver_path
@@ -19,11 +20,11 @@ from pipeline.launch.local import run_local
 from pipeline.launch.reeval import each_checkpoint, evaluate_rest, evaluation_tasks
 from pipeline.launch.tasks import ray_session, ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
+from pipeline.manifest import Manifest, read_manifest
 from pipeline.masks import read_record
 from pipeline.progress import shown
 from pipeline.protocol import check_protocols
 from pipeline.scene import Scene, read_scene
-from pipeline.shards import Manifest, cut_shards, mask_path, masks_hash, read_manifest, scene_record
 
 log = logging.getLogger("crossray")
 

@@ -12,21 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.config import Job
+from pipeline.cutting import camera_record, library_versions, plan_record, scene_record
 from pipeline.errors import CrossrayError
+from pipeline.manifest import Manifest, ShardInfo, digest, shard_file
 from pipeline.photos import Photos
+from pipeline.pictures import LANCZOS, resize
 from pipeline.scene import Scene, ScenePhoto, camera_to_world, measure, photo_key
-from pipeline.shards import (
-    LANCZOS,
-    Manifest,
-    ShardInfo,
-    camera_record,
-    digest,
-    library_versions,
-    plan_record,
-    resize,
-    scene_record,
-    shard_file,
-)
 from pipeline.truth import reduced
 
 if TYPE_CHECKING:

@@ -26,6 +26,7 @@ from pipeline.clock import Clock
 from pipeline.config import Job, flatten, make_job, parse_setting
 from pipeline.errors import CrossrayError
 from pipeline.fit import fit_code, fit_map
+from pipeline.manifest import CameraRecord
 from pipeline.metrics import psnr_of, to_8bit
 from pipeline.nerfbaselines import CAMERAS, FEATURES, METHOD, OUTPUTS
 from pipeline.nerfbaselines.dataset import DatasetPhotos, numbers, picture_of, world_to_camera
@@ -35,7 +36,6 @@ from pipeline.record import LossRecord, record_path
 from pipeline.render import check_reference, read_appearance, render_picture, render_view
 from pipeline.resume import run_identity
 from pipeline.scene import SceneError, camera_to_world, depth_bounds
-from pipeline.shards import CameraRecord
 from pipeline.together import check_finite
 from pipeline.train import (
     LOOK_EVERY,

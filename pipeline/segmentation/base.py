@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.errors import CrossrayError
+from pipeline.manifest import digest
 from pipeline.scene import ScenePhoto
-from pipeline.shards import digest
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 

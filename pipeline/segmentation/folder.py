@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from pipeline.manifest import ShardError
+from pipeline.pictures import decode_mask
 from pipeline.scene import ScenePhoto
 from pipeline.segmentation.base import Segmenter, SegmenterError, SegmenterRecord
-from pipeline.shards import ShardError, decode_mask
 
 ASPECT = 0.02  # relative difference from the photo's aspect ratio: rounding, not cropping
 SHOWN = 5  # problems of a list

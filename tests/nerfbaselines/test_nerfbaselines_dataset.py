@@ -11,6 +11,7 @@ from nerfbaselines_data import TINY
 
 from pipeline.batches import TrainingPhotos
 from pipeline.config import make_job, merge
+from pipeline.cutting import cut_shards
 from pipeline.errors import CrossrayError
 from pipeline.launch.tasks import in_process
 from pipeline.nerfbaselines.dataset import DatasetPhotos, picture_of
@@ -18,7 +19,6 @@ from pipeline.nerfbaselines.describe import main
 from pipeline.nerfbaselines.method import USUAL
 from pipeline.photos import open_photos
 from pipeline.record import LossRecord
-from pipeline.shards import cut_shards
 from pipeline.train import build_model, build_optimiser, set_up_torch, training_step
 from pipeline.work import Context, Work
 

@@ -10,11 +10,12 @@ from tiny_scene import photo_names, write_tiny_scene
 
 from model.cameras import patch_grid
 from pipeline.batches import TrainingPhotos, as_tensor, jitter_colours
+from pipeline.cutting import cut_shards
 from pipeline.errors import CrossrayError
 from pipeline.launch.tasks import in_process
+from pipeline.manifest import CameraRecord
 from pipeline.patches import Patch, PatchPlan
 from pipeline.photos import Photos, open_photos
-from pipeline.shards import CameraRecord, cut_shards
 
 CPU = torch.device("cpu")
 # Photo 3 of the training photos is photo 4 of the scene: the scene's photo 3 is a test photo.

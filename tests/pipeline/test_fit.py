@@ -12,8 +12,8 @@ from torch import Tensor
 from model.methods import CODE, METHODS, TRANSIENT_CODE, HashSpec, MLPSpec, ModelSpec
 from model.scene_model import SceneModel
 from pipeline.fit import FitRecipe, fit_code, rays_through
+from pipeline.manifest import CameraRecord
 from pipeline.render import render_picture, view_rays
-from pipeline.shards import CameraRecord
 
 pytestmark = pytest.mark.slow  # half a minute together: not for every commit
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from model.methods import CODE, METHODS, HashSpec, ModelSpec
 from model.scene_model import SceneModel
 from pipeline.fit import FitRecipe, fit_code, fit_map
+from pipeline.manifest import CameraRecord
 from pipeline.patches import step_generator
 from pipeline.render import View, colour_view, render_picture, render_view
-from pipeline.shards import CameraRecord
 
 WIDTH, HEIGHT, LEFT = 24, 16, 12
 CELLS = 4

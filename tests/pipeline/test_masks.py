@@ -20,15 +20,17 @@ from PIL import Image
 from tiny_scene import write_tiny_scene
 
 from pipeline import cli
+from pipeline.cutting import cut_shards, mask_path
 from pipeline.files import sha256_of
 from pipeline.launch import tasks
 from pipeline.launch.tasks import in_process
+from pipeline.manifest import read_manifest
 from pipeline.masks import BATCH, MaskError, SceneMasks, make_masks, mask_file, read_masks, to_mask
 from pipeline.patches import PatchPlan
 from pipeline.scene import SceneError, read_scene
 from pipeline.segmentation import Segmenter, SegmenterError, SegmenterRecord, find_segmenter
 from pipeline.segmentation.tflite import TFLite
-from pipeline.shards import cut_shards, mask_path, read_manifest, read_shard
+from pipeline.shards import read_shard
 
 pytestmark = pytest.mark.slow  # a quarter of a minute together: not for every commit
 

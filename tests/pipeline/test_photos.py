@@ -12,10 +12,12 @@ from PIL import Image
 from tiny_scene import write_tiny_scene
 
 from pipeline import photos as photos_module
+from pipeline.cutting import cut_shards
 from pipeline.launch.tasks import in_process
+from pipeline.manifest import ShardError
 from pipeline.patches import PatchPlan
 from pipeline.photos import CacheError, open_photos
-from pipeline.shards import ShardError, cut_shards, read_shard
+from pipeline.shards import read_shard
 
 
 def cut(root, out, **settings):

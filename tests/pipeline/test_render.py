@@ -11,6 +11,7 @@ from model.methods import CODE, METHODS, HashSpec, MLPSpec, ModelSpec
 from model.scene_model import ColourMap, SceneModel
 from pipeline import render as module
 from pipeline.errors import CrossrayError
+from pipeline.manifest import CameraRecord
 from pipeline.metrics import to_8bit
 from pipeline.render import (
     View,
@@ -26,7 +27,6 @@ from pipeline.render import (
     view_colours,
     view_rays,
 )
-from pipeline.shards import CameraRecord
 
 CPU = torch.device("cpu")
 MLP = MLPSpec(width=16, coarse_samples=6, fine_samples=6)

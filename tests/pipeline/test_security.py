@@ -33,12 +33,14 @@ from tiny_scene import write_tiny_scene
 from pipeline import cli
 from pipeline.checkpoint import CheckpointError, digest, latest_checkpoint, read_checkpoint, save_checkpoint
 from pipeline.config import JobError, load_job, make_job, save_job
+from pipeline.cutting import cut_shards
 from pipeline.errors import CrossrayError
 from pipeline.files import sha256_of
 from pipeline.importing import import_checkpoint
 from pipeline.launch.process import Spec, run_one
 from pipeline.launch.submit import new_id, stage
 from pipeline.launch.tasks import in_process
+from pipeline.manifest import ShardError, read_manifest
 from pipeline.masks import MaskError, make_masks, read_record
 from pipeline.patches import PatchPlan
 from pipeline.photos import open_photos
@@ -48,7 +50,7 @@ from pipeline.report import Row, write_report
 from pipeline.runs import load_run
 from pipeline.scene import SceneError, read_scene
 from pipeline.segmentation import find_segmenter
-from pipeline.shards import ShardError, cut_shards, read_manifest, read_shard, verify_shards
+from pipeline.shards import read_shard, verify_shards
 from pipeline.status import Status, as_table
 from pipeline.study import load_study, make_study
 

@@ -17,22 +17,14 @@ import pytest
 from PIL import Image
 from tiny_scene import write_tiny_scene
 
+from pipeline.cutting import camera_record, cut_shards, split_photos
 from pipeline.files import sha256_of
 from pipeline.launch.tasks import in_process
+from pipeline.manifest import Manifest, ShardError, digest, read_manifest
 from pipeline.patches import PatchPlan
+from pipeline.pictures import decode_photo
 from pipeline.scene import SceneError, read_scene
-from pipeline.shards import (
-    Manifest,
-    ShardError,
-    camera_record,
-    cut_shards,
-    decode_photo,
-    digest,
-    read_manifest,
-    read_shard,
-    split_photos,
-    verify_shards,
-)
+from pipeline.shards import read_shard, verify_shards
 
 PLAN = PatchPlan(size=4)
 

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 from tiny_scene import write_tiny_scene
 
+from pipeline.cutting import cut_shards, write_shard
 from pipeline.errors import CrossrayError
 from pipeline.launch.tasks import (
     PRIVATE_RAY,
@@ -24,8 +25,8 @@ from pipeline.launch.tasks import (
     ray_session,
     ray_tasks,
 )
+from pipeline.manifest import ShardError
 from pipeline.patches import PatchPlan
-from pipeline.shards import ShardError, cut_shards, write_shard
 
 
 def double(x):

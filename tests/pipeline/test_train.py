@@ -24,6 +24,7 @@ from pipeline.batches import check_references
 from pipeline.board import write_pictures
 from pipeline.checkpoint import committed, latest_checkpoint, read_checkpoint, save_checkpoint
 from pipeline.config import load_job, make_job, merge
+from pipeline.cutting import cut_shards
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import evaluate_run
 from pipeline.launch import run as launch
@@ -33,7 +34,7 @@ from pipeline.launch.torchrun import pick_device, run_rank
 from pipeline.masks import MaskRecord, encode_mask
 from pipeline.photos import open_photos
 from pipeline.resume import TrainingError, checkpoints
-from pipeline.shards import cut_shards, verify_shards
+from pipeline.shards import verify_shards
 from pipeline.train import train
 from pipeline.work import Context
 

@@ -16,6 +16,7 @@ from model.methods import ModelSpec
 from pipeline import evaluate as module
 from pipeline import judge as judge_module
 from pipeline import truth as truth_module
+from pipeline.cutting import cut_shards
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import evaluate_run, run_protocols
 from pipeline.fit import FitRecipe
@@ -29,7 +30,6 @@ from pipeline.photos import open_photos
 from pipeline.protocol import check_protocols, parse_protocol
 from pipeline.render import colour_view, predicted_mask, read_appearance, render_picture, render_view
 from pipeline.runs import load_run
-from pipeline.shards import cut_shards
 from pipeline.train import train
 from pipeline.truth import check_truth, elsewhere, mask_iou, reduced, truth_of
 from pipeline.work import Context

@@ -13,10 +13,10 @@ from tiny_scene import write_tiny_scene
 from model.methods import METHODS
 from pipeline.checkpoint import latest_checkpoint
 from pipeline.config import Job, make_job, merge
+from pipeline.cutting import cut_shards
 from pipeline.launch.tasks import in_process
 from pipeline.photos import Photos, open_photos
 from pipeline.resume import checkpoints
-from pipeline.shards import cut_shards
 from pipeline.train import train
 from pipeline.work import Context
 

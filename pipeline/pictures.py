@@ -1,0 +1,94 @@
+"""Photos and masks as arrays of 8 bits: whatever a file holds in, lossless PNGs out."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from pipeline.manifest import ShardError
+from pipeline.scene import ScenePhoto
+
+LANCZOS, BILINEAR = Image.Resampling.LANCZOS, Image.Resampling.BILINEAR
+
+
+def decode_photo(data: bytes, photo: ScenePhoto) -> np.ndarray:
+    """The photo as uint8 RGB (h, w, 3), as stored: EXIF orientation is ignored, as COLMAP does; alpha is
+    dropped.
+
+    Raises:
+        ShardError: damaged, of a kind that we do not read, or not of its camera's size.
+    """
+    where = f"photo {photo.name}"
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if image.size != (photo.width, photo.height):
+                raise ShardError(
+                    f"{where} has {image.width} x {image.height} pixels and its camera {photo.width} x "
+                    f"{photo.height}: use the photos that the model was made from"
+                )
+            return to_rgb(image, where)
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+        raise ShardError(f"{where} cannot be read ({error}): replace it, or take it out of the split table") from error
+
+
+def decode_mask(data: bytes, photo: ScenePhoto) -> np.ndarray:
+    """The mask as uint8 (h, w), in whatever size it is stored."""
+    where = f"the mask of photo {photo.name}"
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            if image.mode.startswith("I;16"):
+                return _to_8_bits(image)
+            return np.asarray(image.convert("L"))
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+        raise ShardError(f"{where} cannot be read ({error})") from error
+
+
+def to_rgb(image: Image.Image, where: str) -> np.ndarray:
+    """uint8 (h, w, 3) of any 8- or 16-bit picture; gray is repeated."""
+    if image.mode.startswith("I;16"):
+        return np.repeat(_to_8_bits(image)[..., None], 3, axis=2)
+    if image.mode in ("I", "F"):
+        raise ShardError(f"{where} has 32 bits a pixel, whose range is not known: convert it to 8 or 16 bits")
+    return np.asarray(image.convert("RGB"))
+
+
+def _to_8_bits(image: Image.Image) -> np.ndarray:
+    """16 bits to 8: 65535 = 257 * 255, rounded."""
+    return ((np.asarray(image).astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def resize(pixels: np.ndarray, size: tuple[int, int], method: Image.Resampling) -> np.ndarray:
+    """Resample uint8 (h, w[, 3]) to `size` = (width, height); the same size keeps the pixels."""
+    if size == (pixels.shape[1], pixels.shape[0]):
+        return pixels
+    return np.asarray(Image.fromarray(pixels).resize(size, method))
+
+
+def encode_png(pixels: np.ndarray) -> bytes:
+    """Lossless, and nothing but pixels: a fresh image carries no profile and no time of the source."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=4)
+    return buffer.getvalue()
+
+
+def decode_png(data: bytes, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """uint8 (h, w, 3) or (h, w) of a PNG of ours.
+
+    Raises:
+        ValueError: not a PNG, or not of `shape`.
+    """
+    try:
+        image = Image.open(io.BytesIO(data), formats=["PNG"])
+    except Image.DecompressionBombError as error:
+        raise ValueError(str(error)) from None
+    with image:
+        if image.mode not in ("RGB", "L"):
+            raise ValueError(f"a PNG of mode {image.mode}")
+        if shape is not None and image.size != shape[1::-1]:  # before it takes memory
+            raise ValueError(f"a picture of {image.width} x {image.height} pixels, not {shape[1]} x {shape[0]}")
+        pixels = np.asarray(image)
+    if shape is not None and pixels.shape != shape:
+        raise ValueError(f"a picture of shape {pixels.shape}, not {shape}")
+    return pixels
