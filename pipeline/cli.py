@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pipeline.errors import CrossrayError
+from pipeline.launch.stop import interrupted_by_signals
 from pipeline.log import plain, set_up_logging
 
 app = typer.Typer(
@@ -26,12 +27,17 @@ app = typer.Typer(
 
 Settings = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="Set a key of the job file.")]
 
+DropBadPhotos = Annotated[
+    bool, typer.Option("--drop-bad-photos", help="Leave out photos that are missing, damaged or of a wrong size.")
+]
+
 
 def main() -> None:
-    """Run a command; what the user has to put right is one message and exit status 2."""
+    """Run a command; what the user has to put right is one message and exit status 2. Stopped: 130."""
     set_up_logging()
     try:
-        app()
+        with interrupted_by_signals():
+            app()
     except KeyboardInterrupt:
         sys.exit(130)
     except (CrossrayError, OSError) as error:
@@ -217,6 +223,7 @@ def shard(
     out: Annotated[Path, typer.Option(help="Folder for the shards.")],
     downscale: Annotated[int, typer.Option(min=1, help="Photos are reduced by this factor.")] = 2,
     reference_downscale: Annotated[int, typer.Option(min=1, help="The encoder's references, by this factor.")] = 8,
+    drop_bad_photos: DropBadPhotos = False,
     list_patches: Annotated[
         int | None, typer.Option(metavar="EPOCH", min=0, help="Print an epoch's patch plan.")
     ] = None,
@@ -247,6 +254,7 @@ def shard(
             reference_downscale=reference_downscale,
             plan=plan,
             mapper=shown(mapper, "cutting shards"),
+            on_bad_photo="drop" if drop_bad_photos else "refuse",
         )
     if list_patches is None:
         size = sum(s.bytes for s in manifest.shards) / 1e6
@@ -276,6 +284,7 @@ def mask(
         str, typer.Option("--with", help="deeplabv3, maskrcnn, tflite:FILE, or folder:DIR with masks made elsewhere.")
     ],
     replace: Annotated[bool, typer.Option("--replace", help="Masks that are there may be overwritten.")] = False,
+    drop_bad_photos: DropBadPhotos = False,
 ) -> None:
     """Mask what is transient in a scene's photos with a network made elsewhere. Again: goes on from where it was."""
     from pipeline.launch.tasks import ray_tasks
@@ -285,7 +294,13 @@ def mask(
 
     found = find_segmenter(segmenter)
     with ray_tasks() as mapper:
-        masked = make_masks(scene, found, replace=replace, mapper=shown(mapper, "masking photos"))
+        masked = make_masks(
+            scene,
+            found,
+            replace=replace,
+            on_bad_photo="drop" if drop_bad_photos else "refuse",
+            mapper=shown(mapper, "masking photos"),
+        )
     print_line(
         f"{masked.folder}: {masked.photos} photos, {100 * masked.share:.2f} % masked on average; {masked.made} made now"
     )

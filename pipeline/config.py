@@ -51,6 +51,9 @@ class SceneJob(Section):
     """The appearance encoder and the segmenter see the original photo reduced by this factor."""
     shards: Path | None = None
     """Folder of the scene's shards; by default `shards/<scene>-R<downscale>` beside the runs."""
+    on_bad_photo: Literal["refuse", "drop"] = "refuse"
+    """What becomes of a photo whose file is missing, damaged, or not of its camera's size: an error that names it, or
+    it is left out, and the log and the shards' manifest say so."""
 
 
 Share = Annotated[float, Field(ge=0, lt=1)]

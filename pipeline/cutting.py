@@ -7,11 +7,13 @@ idempotent; a shard is cut again if a source photo has changed.
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal, Protocol, TypeVar
 
 import numpy as np
 from filelock import FileLock
@@ -34,14 +36,22 @@ from pipeline.manifest import (
     sidecar_file,
 )
 from pipeline.patches import PatchPlan, steps_per_epoch
-from pipeline.pictures import BILINEAR, LANCZOS, decode_mask, decode_photo, encode_png, resize
-from pipeline.scene import Scene, ScenePhoto, read_scene
+from pipeline.pictures import BILINEAR, LANCZOS, conversion, decode_mask, decode_photo, encode_png, resize
+from pipeline.scene import Scene, ScenePhoto, fingerprint, is_file, read_scene
 
 SHARD_FILE = re.compile(r"shard-[0-9]{6}\.(tar|json)")
 PHOTOS_A_SHARD = 16  # at most
 SHARDS_AT_LEAST = 8  # where there are as many photos: every core gets several
 
-Mapper = Callable[[Callable[["ShardSpec"], "ShardInfo"], list["ShardSpec"]], Iterable["ShardInfo"]]
+log = logging.getLogger("crossray")
+
+T = TypeVar("T")
+
+
+class Mapper(Protocol):
+    """Gives the result of `work` for each spec, in any order (`pipeline.launch.tasks`)."""
+
+    def __call__(self, work: Callable[[ShardSpec], T], specs: list[ShardSpec], /) -> Iterable[T]: ...
 
 
 @dataclass(frozen=True)
@@ -64,11 +74,15 @@ def cut_shards(
     reference_downscale: int = 8,
     plan: PatchPlan,
     mapper: Mapper,
+    on_bad_photo: Literal["refuse", "drop"] = "refuse",
 ) -> Manifest:
     """Cut the scene into `out` and return the manifest; what is there already and right is only verified.
 
-    `mapper(write_shard, specs)` yields the results in any order (`pipeline.launch.tasks`). An interrupted run
-    leaves no half-written file, and the next one finishes it.
+    An interrupted run leaves no half-written file, and the next one finishes it.
+
+    Args:
+        on_bad_photo: photos whose file is missing, damaged, or not of its camera's size end it with an error, or are
+            left out with a warning; to find them, each photo is then decoded once more.
 
     Raises:
         SceneError: the scene cannot be read.
@@ -76,7 +90,8 @@ def cut_shards(
     """
     if downscale < 1 or reference_downscale < 1:
         raise ShardError(f"downscale {downscale}, reference_downscale {reference_downscale}: both must be at least 1")
-    scene = read_scene(scene_root)
+    dropping = on_bad_photo == "drop"
+    scene = read_scene(scene_root, drop_missing=dropping)
     out = Path(out).resolve()
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -85,9 +100,44 @@ def cut_shards(
     except OSError as error:
         raise ShardError(f"{out} cannot be written ({error.strerror}): choose another folder") from error
     try:
+        if dropping:
+            scene = without_bad_photos(scene, out, downscale, reference_downscale, mapper)
         return _cut(scene, out, downscale, reference_downscale, plan, mapper)
     finally:
         lock.release()
+
+
+def specs_of(scene: Scene, out: Path, downscale: int, reference_downscale: int) -> list[ShardSpec]:
+    """A task's work each."""
+    return [
+        ShardSpec(out, i, photos, tuple(mask_path(scene, p) for p in photos), downscale, reference_downscale)
+        for i, photos in enumerate(split_photos(scene.photos))
+    ]
+
+
+def without_bad_photos(scene: Scene, out: Path, downscale: int, reference_downscale: int, mapper: Mapper) -> Scene:
+    """The scene as it is without the photos that cannot be used, which the log counts and names."""
+    bad = dict(scene.dropped)
+    for found in mapper(find_bad_photos, specs_of(scene, out, downscale, reference_downscale)):
+        bad |= found
+    if not bad:
+        return scene
+    reasons = "\n  ".join(reason for _, reason in sorted(bad.items()))
+    log.warning("scene.on_bad_photo: drop: %d photos of %s are left out:\n  %s", len(bad), scene.root, reasons)
+    return read_scene(scene.root, without=bad)
+
+
+def find_bad_photos(spec: ShardSpec) -> dict[str, str]:
+    """Photo -> what is wrong with it, of those of a shard that cannot be used."""
+    bad = {}
+    for photo in spec.photos:
+        try:
+            source = _read_source(photo.path)
+            camera_record(photo, spec.downscale, source)
+            decode_photo(source, photo)
+        except ShardError as error:
+            bad[photo.name] = str(error)
+    return bad
 
 
 def _cut(
@@ -97,11 +147,12 @@ def _cut(
     _refuse_other_content(out, summary, downscale, reference_downscale)
     for stray in out.glob(".*.tmp"):
         stray.unlink()
-    specs = [
-        ShardSpec(out, i, photos, tuple(mask_path(scene, p) for p in photos), downscale, reference_downscale)
-        for i, photos in enumerate(split_photos(scene.photos))
-    ]
+    specs = specs_of(scene, out, downscale, reference_downscale)
     shards = sorted(mapper(write_shard, specs), key=lambda info: info.file)
+    converted = sum((Counter(info.converted) for info in shards), Counter())
+    if converted:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(converted.items()))
+        log.info("photos that were converted to 8-bit RGB: %s", kinds)
     wanted = {name for info in shards for name in (info.file, sidecar_file(info.file))}
     for path in out.iterdir():
         if SHARD_FILE.fullmatch(path.name) and path.name not in wanted:
@@ -114,6 +165,9 @@ def _cut(
         shards=tuple(shards),
         patch_plan=plan_record(plan, scene, downscale),
         libraries=library_versions(),
+        dropped=scene.dropped,
+        source=fingerprint(scene.root),
+        splits=dict(sorted(Counter(photo.split for photo in scene.photos).items())),
     )
     text = manifest.model_dump_json(indent=1) + "\n"
     path = out / MANIFEST
@@ -151,7 +205,14 @@ def write_shard(spec: ShardSpec) -> ShardInfo:
             stream = _Hashed(file)
             _write_tar(stream, spec, cameras, sources, masks)
         keys = tuple(camera.key for camera in cameras)
-        info = ShardInfo(file=path.name, sha256=stream.sha256.hexdigest(), bytes=stream.bytes, keys=keys)
+        converted = Counter(filter(None, map(conversion, sources)))
+        info = ShardInfo(
+            file=path.name,
+            sha256=stream.sha256.hexdigest(),
+            bytes=stream.bytes,
+            keys=keys,
+            converted=dict(sorted(converted.items())),
+        )
         atomic_write(sidecar_path, Sidecar(identity=identity, shard=info).model_dump_json(indent=1) + "\n")
     except OSError as error:
         raise ShardError(f"{path} cannot be written ({error.strerror or error}): is the disk full?") from error
@@ -218,7 +279,7 @@ def split_photos(photos: tuple[ScenePhoto, ...]) -> list[tuple[ScenePhoto, ...]]
 def mask_path(scene: Scene, photo: ScenePhoto) -> Path | None:
     """The mask of a photo, None where there is none; a photo's name cannot lead out of the folder of masks."""
     path = (scene.root / "masks" / photo.name).with_suffix(".png")
-    return path if ".." not in path.relative_to(scene.root).parts and path.is_file() else None
+    return path if ".." not in path.relative_to(scene.root).parts and is_file(path) else None
 
 
 def masks_hash(scene: Scene) -> str | None:

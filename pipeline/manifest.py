@@ -68,6 +68,7 @@ class ShardInfo(_Record):
     sha256: Sha256
     bytes: int
     keys: tuple[Key, ...] = Field(min_length=1)
+    converted: dict[str, int] = {}  # what the sources were where they were not 8-bit RGB, and how many
 
 
 class Sidecar(_Record):
@@ -106,6 +107,9 @@ class Manifest(_Record):
     shards: tuple[ShardInfo, ...] = Field(min_length=1)
     patch_plan: PlanRecord
     libraries: dict[str, str]  # whose versions decide the bytes
+    dropped: dict[str, str] = {}  # photos of the scene that are not here, as their files cannot be used -> reason
+    source: Sha256 | None = None  # fingerprint of the scene's files; None: not known
+    splits: dict[str, int] = {}  # split -> photos
 
     @model_validator(mode="after")
     def _plain_names_and_unique_keys(self) -> Manifest:
@@ -123,10 +127,13 @@ class Manifest(_Record):
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 of all that decides what a reader sees: everything but the patch plan and the library
-        versions.
+        """SHA-256 of all that decides what a reader sees: not the patch plan, the library versions, and what is told
+        of the sources.
         """
-        return digest(self.model_dump(mode="json", exclude={"patch_plan", "libraries"}))
+        content = self.model_dump(mode="json", exclude={"patch_plan", "libraries", "dropped", "source", "splits"})
+        for shard in content["shards"]:
+            del shard["converted"]
+        return digest(content)
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -48,6 +48,10 @@ class MaskError(CrossrayError):
     """Masks that cannot be made, or that are not ours to replace."""
 
 
+class BadPhotoError(MaskError):
+    """A photo that cannot be read."""
+
+
 class _Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -79,6 +83,7 @@ class MaskBatch:
     identity: str
     photos: tuple[ScenePhoto, ...]
     replace: bool
+    drop_bad: bool
 
 
 @dataclass(frozen=True)
@@ -100,18 +105,27 @@ class Masked:
     share: float  # mean over photos of the share that is masked
 
 
-def make_masks(scene_root: Path, segmenter: Segmenter, *, replace: bool = False, mapper: Mapper) -> Masked:
+def make_masks(
+    scene_root: Path,
+    segmenter: Segmenter,
+    *,
+    replace: bool = False,
+    on_bad_photo: Literal["refuse", "drop"] = "refuse",
+    mapper: Mapper,
+) -> Masked:
     """Mask the photos of a scene; masks that are there, of the same segmenter and photo, are kept.
 
     `mapper(mask_photos, batches)` yields the results in any order (`pipeline.launch.tasks`). `replace` allows to
-    overwrite masks of another segmenter, and masks that were not made here.
+    overwrite masks of another segmenter, and masks that were not made here. `on_bad_photo` is as for shards: photos
+    that cannot be read may go without a mask.
 
     Raises:
         SceneError: the scene cannot be read.
         SegmenterError: the segmenter cannot be used, or not for these photos.
         MaskError: `masks/` cannot be written, or holds what is not ours to replace; or a photo cannot be read.
     """
-    scene = read_scene(scene_root)
+    drop_bad = on_bad_photo == "drop"
+    scene = read_scene(scene_root, drop_missing=drop_bad)
     folder = scene.root / "masks"
     check_names(folder, scene.photos)
     described = segmenter.describe(scene.photos)
@@ -125,13 +139,19 @@ def make_masks(scene_root: Path, segmenter: Segmenter, *, replace: bool = False,
             "you can write"
         ) from error
     try:
-        return _make(scene, folder, segmenter, described, replace, mapper)
+        return _make(scene, folder, segmenter, described, replace, drop_bad, mapper)
     finally:
         lock.release()
 
 
 def _make(
-    scene: Scene, folder: Path, segmenter: Segmenter, described: SegmenterRecord, replace: bool, mapper: Mapper
+    scene: Scene,
+    folder: Path,
+    segmenter: Segmenter,
+    described: SegmenterRecord,
+    replace: bool,
+    drop_bad: bool,
+    mapper: Mapper,
 ) -> Masked:
     for stray in folder.rglob(".*.tmp"):
         stray.unlink()
@@ -140,11 +160,16 @@ def _make(
     if before and before.segmenter.identity != described.identity:
         (folder / RECORD).unlink()  # it would describe masks that are about to go
     batches = [
-        MaskBatch(folder, segmenter, described.identity, scene.photos[k : k + BATCH], replace)
+        MaskBatch(folder, segmenter, described.identity, scene.photos[k : k + BATCH], replace, drop_bad)
         for k in range(0, len(scene.photos), BATCH)
     ]
     results = [result for batch in mapper(mask_photos, batches) for result in batch]
     results.sort(key=lambda result: result.photo)
+    bad = len(scene.photos) + len(scene.dropped) - len(results)
+    if bad:
+        log.warning("%d photos of %s cannot be read and have no mask", bad, scene.root)
+    if not results:
+        raise MaskError(f"{scene.root}: no photo is left to be masked")
     made = sum(result.made for result in results)
     now = SceneMasks(segmenter=described, photos={result.photo: result.record for result in results})
     if made or before is None or before.photos != now.photos or before.segmenter.identity != described.identity:
@@ -159,9 +184,16 @@ def mask_photos(batch: MaskBatch) -> list[MaskResult]:
     """Mask the photos of a batch, each unless its mask is there.
 
     Raises:
-        MaskError: a photo that cannot be read, or a mask that was changed since we made it.
+        MaskError: a photo that cannot be read (unless those are dropped), or a mask that was changed since we made it.
     """
-    return [mask_photo(batch, photo) for photo in batch.photos]
+    results = []
+    for photo in batch.photos:
+        try:
+            results.append(mask_photo(batch, photo))
+        except BadPhotoError:
+            if not batch.drop_bad:
+                raise
+    return results
 
 
 def mask_photo(batch: MaskBatch, photo: ScenePhoto) -> MaskResult:
@@ -189,7 +221,7 @@ def mask_photo(batch: MaskBatch, photo: ScenePhoto) -> MaskResult:
     try:
         pixels = decode_photo(data, photo)
     except ShardError as error:
-        raise MaskError(str(error)) from error
+        raise BadPhotoError(str(error)) from error
     mask = to_mask(batch.segmenter.probability(photo, pixels), (photo.width, photo.height))
     record = MaskRecord(**made_from, pixels=pixels_hash(mask), share=float(mask.mean() / 255))
     try:

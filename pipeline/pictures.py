@@ -11,6 +11,7 @@ from pipeline.manifest import ShardError
 from pipeline.scene import ScenePhoto
 
 LANCZOS, BILINEAR = Image.Resampling.LANCZOS, Image.Resampling.BILINEAR
+KINDS = {"1": "grayscale", "L": "grayscale", "LA": "grayscale with alpha", "RGBA": "RGB with alpha", "P": "palette"}
 
 
 def decode_photo(data: bytes, photo: ScenePhoto) -> np.ndarray:
@@ -31,6 +32,14 @@ def decode_photo(data: bytes, photo: ScenePhoto) -> np.ndarray:
             return to_rgb(image, where)
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
         raise ShardError(f"{where} cannot be read ({error}): replace it, or take it out of the split table") from error
+
+
+def conversion(data: bytes) -> str | None:
+    """What a photo is that `decode_photo` has to convert, such as CMYK; None for 8-bit RGB."""
+    with Image.open(io.BytesIO(data)) as image:
+        if image.mode.startswith("I;16"):
+            return "16-bit grayscale"
+        return None if image.mode == "RGB" else KINDS.get(image.mode, image.mode)
 
 
 def decode_mask(data: bytes, photo: ScenePhoto) -> np.ndarray:

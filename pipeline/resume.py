@@ -24,6 +24,7 @@ from pipeline.photos import Photos
 
 log = logging.getLogger("crossray")
 
+LOCK = ".training.lock"  # held by who trains the run
 PATIENCE = 20.0  # seconds in which a rank that was killed has let go of the run
 LEASE = 150.0  # seconds until a network's disk lets go of what a node held that was lost
 
@@ -45,7 +46,7 @@ def own_run(job: Job) -> Iterator[None]:
         TrainingError: another process holds it.
     """
     job.run.mkdir(parents=True, exist_ok=True)
-    lock, began = FileLock(job.run / ".training.lock"), time.monotonic()
+    lock, began = FileLock(job.run / LOCK), time.monotonic()
     while not lock.is_locked:
         try:
             lock.acquire(timeout=PATIENCE)
@@ -63,6 +64,13 @@ def own_run(job: Job) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def check_run_folder(job: Job) -> None:
+    """OSError where the folder of the run that this process holds has been moved or removed, or its disk has gone: a
+    new one in its place would hold half a run."""
+    if not (job.run / LOCK).exists():
+        raise OSError(f"{job.run} has vanished: it was moved or removed, or its disk has gone")
 
 
 def run_identity(job: Job, photos: Photos, steps_per_epoch: int) -> dict[str, Any]:

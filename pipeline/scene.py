@@ -13,21 +13,26 @@ of CR-NeRF.
 from __future__ import annotations
 
 import csv
+import hashlib
+import json
 import logging
 import re
-from dataclasses import dataclass
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.colmap import import_pycolmap
 from pipeline.errors import CrossrayError
+from pipeline.files import sha256_of
 
 SPLITS = ("train", "val", "test")
 MODEL_FILES = ("cameras", "images", "points3D")
 # Models whose parameters beyond focal lengths and centre are a distortion that vanishes at 0.
 PINHOLE_AT_ZERO = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-UNDISTORT = "undistort with `colmap image_undistorter` and read the scene that it makes"
 FAR = 5.0  # the largest far bound of a scene, in scene units
 
 log = logging.getLogger("crossray")
@@ -64,39 +69,84 @@ class Scene:
     scale: float  # COLMAP units per scene unit
     box: np.ndarray  # (2, 3) float32: 1st and 99th percentile of the points on each axis, scene units
     num_points: int
+    dropped: dict[str, str] = field(default_factory=dict)
+    """Photos that were left out because their files cannot be used -> the reason."""
 
 
-def read_scene(root: Path, name: str | None = None) -> Scene:
+def read_scene(
+    root: Path, name: str | None = None, *, without: Mapping[str, str] | None = None, drop_missing: bool = False
+) -> Scene:
     """Read the scene in the folder `root`; `name` is by default that of its tsv, else of the folder.
 
     Photos that the split table lists and the model lacks are left out with a warning. Without a table, every
     eighth photo in name order, from the first on, is a test photo.
 
+    Args:
+        without: photos to leave out, as if the split table did not list them -> the reason.
+        drop_missing: leave out photos whose file is missing, too.
+
     Raises:
-        SceneError: no model, no photos, a camera that is not an undistorted pinhole, a degenerate model
-        (`check_model`),
-            several split tables, or a photo whose file is missing.
+        SceneError: no model, no photos, two photos of one name, a camera that is not an undistorted pinhole, a
+            degenerate model (`check_model`), several split tables, or a photo whose file is missing.
     """
     root = Path(root).resolve()
     if not root.is_dir():
         raise SceneError(f"{root}: no such folder; a scene is a folder with photos and a COLMAP model")
     folder, model = find_model(root)
     table = find_table(root)
-    by_name = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    by_name = images_by_name(model, folder)
     if not by_name:
         raise SceneError(f"{folder}: the COLMAP model has no registered photo")
     splits = read_splits(table, by_name) if table else hold_out(by_name)
     if not splits:
         raise SceneError(f"{root}: no photo is left; {table} names none that the model in {folder} has")
-    if "train" not in splits.values():
-        raise SceneError(f"{root}: no training photo among the {len(splits)} posed ones; give some the split 'train'")
-    images = [by_name[n] for n in sorted(splits)]
-    check_model(model, images)
+    dropped = {n: reason for n, reason in (without or {}).items() if n in splits}
+    kept = left_over(root, splits, dropped)
+    check_model(model, [by_name[n] for n in kept])
     photo_folder = find_photo_folder(root, folder)
-    for image in images:
-        if not is_inside(photo_folder, image.name) or not (photo_folder / image.name).is_file():
-            raise SceneError(f"photo {image.name} of the model in {folder} is not in {photo_folder}")
-    return pose_photos(root, name or (table.stem if table else root.name), model, images, splits, photo_folder)
+    missing = [n for n in kept if not is_photo(photo_folder, n)]
+    if missing and not drop_missing:
+        raise SceneError(
+            f"photo {missing[0]} of the model in {folder} is not in {photo_folder}; put it there, take it out of the "
+            "split table, or let scene.on_bad_photo: drop leave it out"
+        )
+    dropped |= {n: f"photo {n} is missing" for n in missing}
+    images = [by_name[n] for n in left_over(root, splits, dropped)]
+    check_undistorted(root, model, images, folder, photo_folder)
+    scene = pose_photos(root, name or (table.stem if table else root.name), model, images, splits, photo_folder)
+    return replace(scene, dropped=dropped)
+
+
+def images_by_name(model: Any, folder: Path) -> dict[str, Any]:
+    """Photo name -> registered image of a `pycolmap.Reconstruction`.
+
+    Raises:
+        SceneError: two have one name.
+    """
+    found: dict[str, Any] = {}
+    for image in (model.images[i] for i in model.reg_image_ids()):
+        if found.setdefault(image.name, image) is not image:
+            raise SceneError(
+                f"{folder}: images {found[image.name].image_id} and {image.image_id} are both named {image.name}; "
+                "which camera is the photo's? reconstruct again, or take one out of the model"
+            )
+    return found
+
+
+def left_over(root: Path, splits: dict[str, str], dropped: dict[str, str]) -> list[str]:
+    """Names of the photos that are not dropped, sorted.
+
+    Raises:
+        SceneError: none of them is for training.
+    """
+    kept = sorted(splits.keys() - dropped)
+    if not any(splits[n] == "train" for n in kept):
+        first = next(iter(dropped.values()), "")
+        left = f", {len(dropped)} were left out, as their files cannot be used ({first})" if dropped else ""
+        raise SceneError(
+            f"{root}: no training photo among the {len(kept)} posed ones{left}; give some the split 'train'"
+        )
+    return kept
 
 
 def pose_photos(
@@ -118,7 +168,7 @@ def pose_photos(
                 path=photo_folder / image.name,
                 width=int(camera.width),
                 height=int(camera.height),
-                intrinsics=pinhole(camera, image),
+                intrinsics=pinhole(camera),
                 c2w=camera_to_world(w2c, scale),
                 near=near / scale,
                 far=far / scale,
@@ -161,16 +211,8 @@ def camera_to_world(w2c: np.ndarray, scale: float) -> np.ndarray:
     return np.column_stack([rotation, -rotation @ w2c[:, 3] / scale]).astype(np.float32)
 
 
-def pinhole(camera: Any, image: Any) -> tuple[float, float, float, float]:
+def pinhole(camera: Any) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a COLMAP camera without distortion."""
-    kind = camera.model.name
-    where = f"camera {image.camera_id} of photo {image.name}"
-    if kind not in PINHOLE_AT_ZERO:
-        raise SceneError(f"{where} is {kind}, not a pinhole: {UNDISTORT}")
-    distortion = [float(camera.params[i]) for i in camera.extra_params_idxs()]
-    if any(distortion):
-        values = ", ".join(f"{k:g}" for k in distortion)
-        raise SceneError(f"{where} is distorted (k={values}): {UNDISTORT}")
     return (
         float(camera.focal_length_x),
         float(camera.focal_length_y),
@@ -206,14 +248,15 @@ def read_splits(table: Path, posed: dict[str, Any]) -> dict[str, str]:
     Columns are found by name, for scenes differ in their order. Rows with an empty id were excluded by
     NeRF-W's authors. The id itself is not used: photos are matched by name.
     """
-    with table.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file, delimiter="\t")
-        lacking = {"filename", "id", "split"} - set(reader.fieldnames or ())
-        if lacking:
-            raise SceneError(
-                f"{table}: no column {', '.join(sorted(lacking))}; NeRF-W's tables have filename, id, split"
-            )
-        rows = [(number, row) for number, row in enumerate(reader, start=2)]
+    try:
+        with table.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, delimiter="\t")
+            lacking = {"filename", "id", "split"} - set(reader.fieldnames or ())
+            rows = [(number, row) for number, row in enumerate(reader, start=2)]
+    except (ValueError, csv.Error) as error:
+        raise SceneError(f"{table} cannot be read ({error}): a split table is UTF-8 text with tabs") from error
+    if lacking:
+        raise SceneError(f"{table}: no column {', '.join(sorted(lacking))}; NeRF-W's tables have filename, id, split")
     splits: dict[str, str] = {}
     without_id = 0
     for number, row in rows:
@@ -253,29 +296,44 @@ def find_model(root: Path) -> tuple[Path, Any]:
     `dense` is looked into first: its model is the undistorted one. Of several beside each other, the one with
     most photos.
     """
-    import pycolmap
+    pycolmap = import_pycolmap()
+    models = []
+    for folder in model_folders(root):
+        try:
+            models.append((folder, pycolmap.Reconstruction(str(folder))))
+        except Exception as error:  # pycolmap raises whatever its C++ parser met: bad_alloc, map::at, ...
+            raise SceneError(f"{folder}: the COLMAP model cannot be read ({error}); is a file cut short?") from error
+    if not models:
+        raise SceneError(
+            f"{root}: no COLMAP model (cameras, images and points3D as .bin or .txt) in dense/sparse, sparse, "
+            "their numbered folders, or the folder itself"
+        )
+    folder, model = max(models, key=lambda pair: pair[1].num_reg_images())
+    if len(models) > 1:
+        counts = ", ".join(f"{f.relative_to(root)}: {m.num_reg_images()}" for f, m in models)
+        log.info("several COLMAP models (photos in each: %s); reading %s", counts, folder.relative_to(root))
+    return folder, model
 
+
+def model_folders(root: Path) -> list[Path]:
+    """The folders beside each other that hold the scene's models."""
     for base in (root / "dense" / "sparse", root / "sparse", root):
         folders = [f for f in (base, *sorted(base.glob("[0-9]*"))) if holds_model(f)]
-        if not folders:
-            continue
-        models = []
-        for folder in folders:
-            try:
-                models.append((folder, pycolmap.Reconstruction(str(folder))))
-            except Exception as error:  # pycolmap raises whatever its C++ parser met: bad_alloc, map::at, ...
-                raise SceneError(
-                    f"{folder}: the COLMAP model cannot be read ({error}); is a file cut short?"
-                ) from error
-        folder, model = max(models, key=lambda pair: pair[1].num_reg_images())
-        if len(models) > 1:
-            counts = ", ".join(f"{f.relative_to(root)}: {m.num_reg_images()}" for f, m in models)
-            log.info("several COLMAP models (photos in each: %s); reading %s", counts, folder.relative_to(root))
-        return folder, model
-    raise SceneError(
-        f"{root}: no COLMAP model (cameras, images and points3D as .bin or .txt) in dense/sparse, sparse, "
-        "their numbered folders, or the folder itself"
-    )
+        if folders:
+            return folders
+    return []
+
+
+def fingerprint(root: Path) -> str:
+    """SHA-256 of the files that say where the photos were taken from and which are for training: models and split
+    table. The same one, the same scene; it takes no reading of the model, which for 5,000 photos is a minute
+    (benchmarks/results/start.json).
+    """
+    root = Path(root).resolve()
+    table = find_table(root)
+    files = [f for folder in model_folders(root) for stem in MODEL_FILES for f in folder.glob(f"{stem}.*")]
+    hashes = [(f.relative_to(root).as_posix(), sha256_of(f)) for f in sorted([*files, *([table] if table else [])])]
+    return hashlib.sha256(repr(hashes).encode()).hexdigest()
 
 
 def holds_model(folder: Path) -> bool:
@@ -293,6 +351,19 @@ def find_photo_folder(root: Path, model_folder: Path) -> Path:
         if folder.is_dir():
             return folder
     raise SceneError(f"{root}: no photos; expected a folder dense/images or images")
+
+
+def is_file(path: Path) -> bool:
+    """Whether it is one; a name that the file system cannot have, such as one of 300 characters, is none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def is_photo(folder: Path, name: str) -> bool:
+    """Whether `name` is a file of the photo folder."""
+    return is_inside(folder, name) and is_file(folder / name)
 
 
 def is_inside(folder: Path, name: str) -> bool:
@@ -337,6 +408,30 @@ def check_model(model: Any, images: list[Any] | None = None) -> None:
         np.stack([point.xyz for point in model.points3D.values()]),
     ):
         raise SceneError(f"most of the {len(images)} cameras stand in one spot: {advice}")
+
+
+def check_undistorted(root: Path, model: Any, images: list[Any], folder: Path, photo_folder: Path) -> None:
+    """Refuse cameras that are no pinholes, with the command that makes a scene of pinholes of this one.
+
+    Raises:
+        SceneError: a photo's camera is of another kind, or distorted.
+    """
+    for image in images:
+        camera = model.cameras[image.camera_id]
+        distortion = [float(camera.params[i]) for i in camera.extra_params_idxs()]
+        if camera.model.name not in PINHOLE_AT_ZERO:
+            wrong = f"is {camera.model.name}, not a pinhole"
+        elif any(distortion):
+            wrong = f"is distorted (k={', '.join(f'{k:g}' for k in distortion)})"
+        else:
+            continue
+        target = root if not (root / "dense").exists() else root.with_name(f"{root.name}-undistorted")
+        paths = ", ".join(json.dumps(str(path)) for path in (target / "dense", folder, photo_folder))
+        command = shlex.quote(f"import pycolmap; pycolmap.undistort_images({paths})")
+        raise SceneError(
+            f"camera {image.camera_id} of photo {image.name} {wrong}: undistort the photos, then read the scene "
+            f"{target}:\n  python -c {command}"
+        )
 
 
 def is_collapsed(centres: np.ndarray, points: np.ndarray) -> bool:

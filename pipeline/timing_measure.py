@@ -5,12 +5,9 @@ A peak beside it: what this machine reaches at best in a matrix product, so that
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import re
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -18,6 +15,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
+
+from pipeline.memory import give_back
 
 LEAST = 3  # repeats, however long they take
 MOST = 1000  # repeats, however short they are
@@ -110,11 +109,10 @@ class PeakMemory:
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.before: int | None = None
-        gc.collect()
+        give_back()  # else what is measured would find room in what was freed, and not be seen to grow
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
             return
-        give_back()
         try:
             CLEAR.write_text("5")
             self.before = resident("VmRSS")
@@ -126,13 +124,6 @@ class PeakMemory:
         if self.device.type == "cuda":
             return torch.cuda.max_memory_allocated(self.device) / MIB
         return None if self.before is None else max(0, resident("VmHWM") - self.before) / MIB
-
-
-def give_back() -> None:
-    """Return what this process has freed to the system: else what is measured next would find room in it, and not be
-    seen to grow."""
-    with suppress(AttributeError, OSError):  # only glibc has it
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def memory_of(device: torch.device) -> Literal["host", "cuda"]:

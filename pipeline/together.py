@@ -18,7 +18,7 @@ from pipeline.best import best_steps, lock_of_best
 from pipeline.checkpoint import committed, prune, save_checkpoint
 from pipeline.clock import Speed
 from pipeline.record import GRADIENT, LossRecord
-from pipeline.resume import TrainingError, checkpoints
+from pipeline.resume import TrainingError, check_run_folder, checkpoints
 from pipeline.work import Context, Work
 
 log = logging.getLogger("crossray")
@@ -65,7 +65,9 @@ def save(
         TrainingError: the `last` one cannot be written. An earlier one that cannot be is only missed.
     """
     began, job, step = time.perf_counter(), work.job, speed.clock.step
-    folder, problem = checkpoints(job), attempt(record.save)
+    folder = checkpoints(job)
+    problem = attempt(lambda: check_run_folder(job)) if work.context.rank == 0 else None
+    problem = problem or attempt(record.save)
     if work.context.world_size > 1:
         failed = torch.tensor([float(problem is not None)])
         dist.all_reduce(failed, group=together)
@@ -76,8 +78,8 @@ def save(
         problem = problem or attempt(lambda: save_checkpoint(folder, step, *state, meta))
     if problem and last:
         raise TrainingError(
-            f"step {step} cannot be saved: {problem}. Earlier checkpoints in {folder} are whole: make room, and run "
-            "the same command again"
+            f"step {step} cannot be saved: {problem}. Earlier checkpoints in {folder} are whole: make room (or put the "
+            "folder back), and run the same command again"
         )
     if problem:
         log.error("step %d cannot be saved: %s; training goes on and tries again at the next checkpoint", step, problem)

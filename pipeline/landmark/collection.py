@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from pipeline.colmap import import_pycolmap
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
 from pipeline.landmark.crowd import Tourist, place_crowd
@@ -310,8 +311,7 @@ def _observations(seed: int, index: int, camera: Pinhole) -> tuple[np.ndarray, n
 
 def _write_model(folder: Path, seed: int, records: list[PhotoRecord], seen: list) -> None:
     """COLMAP's binary files. Camera ids are those of the images, moved on by one: who mixes them up finds out."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     model = pycolmap.Reconstruction()
     points, colours = surface_points(seed)
     for i, (record, (_, pixels)) in enumerate(zip(records, seen, strict=True)):
@@ -335,8 +335,7 @@ def _write_model(folder: Path, seed: int, records: list[PhotoRecord], seen: list
 
 def _tracks(seen: list[np.ndarray]) -> Iterator[tuple[int, Any]]:
     """(number, track) of every point that some photo sees; `seen[i]` are the points of photo i."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     numbers = np.concatenate(seen)
     images = np.repeat(np.arange(1, len(seen) + 1), [s.size for s in seen])
     places = np.concatenate([np.arange(s.size) for s in seen])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -37,15 +36,14 @@ def run_reeval(reeval: ReevalJob) -> Summary | None:
         raise CrossrayError("a re-evaluation starts its tasks itself; start it without torchrun")
     find_runs(reeval)
     seconds = interval(reeval)
-    with interrupted_by_signals():
-        if seconds is None:
-            with tasks_for(reeval) as mapper:
-                return one_pass(reeval, mapper)
-        try:
-            with tasks_for(reeval) as mapper:
-                keep_passing(reeval, mapper, seconds)
-        except KeyboardInterrupt:
-            log.info("stopped; nothing is half-written, and the next start goes on")
+    if seconds is None:
+        with tasks_for(reeval) as mapper:
+            return one_pass(reeval, mapper)
+    try:
+        with tasks_for(reeval) as mapper:
+            keep_passing(reeval, mapper, seconds)
+    except KeyboardInterrupt:
+        log.info("stopped; nothing is half-written, and the next start goes on")
     return None
 
 
@@ -104,26 +102,6 @@ def needs_of_evaluation(job: Job, gpus: float | None, there: float) -> dict[str,
     if job.device != "cpu" and there > 0:
         return {"num_cpus": 0, "num_gpus": gpus or job.evaluate.gpus}
     return {"num_cpus": job.threads}
-
-
-@contextmanager
-def interrupted_by_signals() -> Iterator[None]:
-    """SIGTERM is a Ctrl-C. Either may come several times for one wish, to a process and to its group: what comes within
-    two seconds of the first does not disturb the cleaning up."""
-    first: list[float] = []
-
-    def interrupt(number: int, frame: object) -> None:
-        now = time.monotonic()
-        if not first or now - first[0] > 2:
-            first.append(now)
-            raise KeyboardInterrupt
-
-    previous = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 class EachCheckpoint(threading.Thread):

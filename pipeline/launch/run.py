@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter
+from collections.abc import Mapping
 from contextlib import nullcontext
 from importlib.util import find_spec
 from typing import Any
@@ -20,11 +22,12 @@ from pipeline.launch.local import run_local
 from pipeline.launch.reeval import each_checkpoint, evaluate_rest, evaluation_tasks
 from pipeline.launch.tasks import ray_session, ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
-from pipeline.manifest import Manifest, read_manifest
+from pipeline.manifest import MANIFEST, Manifest, read_manifest
 from pipeline.masks import read_record
+from pipeline.memory import give_back
 from pipeline.progress import shown
 from pipeline.protocol import check_protocols
-from pipeline.scene import Scene, read_scene
+from pipeline.scene import Scene, fingerprint, read_scene
 
 log = logging.getLogger("crossray")
 
@@ -136,11 +139,21 @@ def claim_run(job: Job) -> None:
         save_job(job, path)
 
 
-def scene_at_hand(job: Job) -> Scene | None:
-    """The job's scene. Shards may travel without it: None where it is not there, or pycolmap is not."""
+def scene_at_hand(job: Job, manifest: Manifest | None) -> Scene | None:
+    """The job's scene, without the photos that its shards lack. Shards may travel without it: None where it is not
+    there, or pycolmap is not.
+    """
     if not job.scene.path.is_dir() or find_spec("pycolmap") is None:
         return None
-    return read_scene(job.scene.path)
+    without = manifest.dropped if manifest else {}
+    return read_scene(job.scene.path, without=without, drop_missing=job.scene.on_bad_photo == "drop")
+
+
+def known(job: Job, manifest: Manifest) -> bool:
+    """Whether the job's scene is the one of the shards by its files alone, and nothing else of it is asked for."""
+    if job.model.transient == "fixed" or not job.scene.path.is_dir() or manifest.source is None:
+        return False
+    return fingerprint(job.scene.path) == manifest.source
 
 
 def check_scene(job: Job, scene: Scene, manifest: Manifest) -> None:
@@ -149,6 +162,15 @@ def check_scene(job: Job, scene: Scene, manifest: Manifest) -> None:
         raise CrossrayError(
             f"scene.path: the shards in {job.shards} were cut from another scene, or from {job.scene.path} before it "
             "changed; --set scene.shards=FOLDER names other ones, or remove that folder"
+        )
+
+
+def check_test_photos(job: Job, splits: Mapping[str, int]) -> None:
+    """CrossrayError where the job is to be evaluated, and its scene has no test photo: said before the training."""
+    if job.evaluate.protocols and not splits.get("test"):
+        raise CrossrayError(
+            f"evaluate.protocols: {', '.join(job.evaluate.protocols)}, but {job.scene.path} has no test photo among "
+            f"its {sum(splits.values())}; give some the split 'test', or --set 'evaluate.protocols=[]'"
         )
 
 
@@ -180,27 +202,41 @@ def ensure_shards(job: Job) -> Manifest:
     folder = job.shards
     folder.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(folder.parent / f".{folder.name}.lock"):
-        scene, there = scene_at_hand(job), (folder / "manifest.json").is_file()
-        fixed = job.model.transient == "fixed"
-        if fixed and scene is not None:
-            check_masks(job, scene)
-        if not there:
-            if scene is None and not job.scene.path.is_dir():
-                raise CrossrayError(
-                    f"scene.path: {job.scene.path} is not a folder, and there are no shards in {folder}; "
-                    "--set scene.path=FOLDER names the posed scene"
-                )
-            return cut(job)
-        manifest = read_manifest(folder)
-        if scene is None:
-            log.info("%s is not at hand; training on the shards of %s", job.scene.path, manifest.scene.name)
-        else:
-            check_scene(job, scene, manifest)
-        check_sizes(job, manifest)
-        if fixed and scene is not None and masks_hash(scene) != manifest.masks:
-            log.info("the masks of %s have changed; its shards are cut again", job.scene.path)
-            return cut(job)
-        return manifest
+        manifest = read_manifest(folder) if (folder / MANIFEST).is_file() else None
+        if manifest is not None and known(job, manifest):
+            check_test_photos(job, manifest.splits)
+            check_dropped(job, manifest)
+            check_sizes(job, manifest)
+            return manifest
+        manifest = compared(job, scene_at_hand(job, manifest), manifest)
+    give_back()  # of a large model, which pycolmap holds outside Python
+    return manifest
+
+
+def compared(job: Job, scene: Scene | None, manifest: Manifest | None) -> Manifest:
+    """The job's shards, with a look at its scene if that is at hand: cut if there are none, or of other masks."""
+    if scene is not None:
+        check_test_photos(job, Counter(photo.split for photo in scene.photos))
+    fixed = job.model.transient == "fixed"
+    if fixed and scene is not None:
+        check_masks(job, scene)
+    if manifest is None:
+        if scene is None and not job.scene.path.is_dir():
+            raise CrossrayError(
+                f"scene.path: {job.scene.path} is not a folder, and there are no shards in {job.shards}; "
+                "--set scene.path=FOLDER names the posed scene"
+            )
+        return cut(job)
+    check_dropped(job, manifest)
+    if scene is None:
+        log.info("%s is not at hand; training on the shards of %s", job.scene.path, manifest.scene.name)
+    else:
+        check_scene(job, scene, manifest)
+    check_sizes(job, manifest)
+    if fixed and scene is not None and masks_hash(scene) != manifest.masks:
+        log.info("the masks of %s have changed; its shards are cut again", job.scene.path)
+        return cut(job)
+    return manifest
 
 
 def cut(job: Job) -> Manifest:
@@ -215,6 +251,17 @@ def cut(job: Job) -> Manifest:
             reference_downscale=scene.reference_downscale,
             plan=job.patch,
             mapper=shown(mapper, f"cutting shards of {scene.path.name}"),
+            on_bad_photo=scene.on_bad_photo,
+        )
+
+
+def check_dropped(job: Job, manifest: Manifest) -> None:
+    """CrossrayError where the shards lack photos, and the job did not say that they may."""
+    if manifest.dropped and job.scene.on_bad_photo == "refuse":
+        raise CrossrayError(
+            f"scene.on_bad_photo: refuse, but the shards in {job.shards} were cut without {len(manifest.dropped)} "
+            f"photos ({next(iter(manifest.dropped.values()))}); mend them and remove that folder, or --set "
+            "scene.on_bad_photo=drop"
         )
 
 

@@ -80,6 +80,29 @@ def stopped_by_signals(path: Path) -> Iterator[StopFile]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def interrupted_by_signals() -> Iterator[None]:
+    """SIGTERM is a Ctrl-C, and both are told. Either may come several times for one wish, to a process and to its
+    group: what comes within two seconds of the first does not disturb the cleaning up.
+    """
+    first: list[float] = []
+
+    def interrupt(number: int, frame: object) -> None:
+        now = time.monotonic()
+        if not first or now - first[0] > 2:
+            first.append(now)
+            name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+            log.info("stopping (%s): what is finished stays, and nothing is half-written", name)
+            raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
 class StopRequest:
     """Whether somebody has written to a file that was empty before, or has removed it: its driver is gone then."""
 

@@ -6,7 +6,10 @@ from __future__ import annotations
 
 import logging
 import math
+import shlex
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -146,7 +149,7 @@ def test_tables_that_cannot_be_read_are_named(root):
         (
             "SIMPLE_RADIAL",
             "48 24 18 0.01",
-            r"camera 102 of photo photo_002.jpg is distorted \(k=0.01\).*image_undistorter",
+            r"(?s)camera 102 of photo photo_002.jpg is distorted \(k=0.01\).*undistort_images",
         ),
         ("OPENCV", "48 48 24 18 0 0 0.1 0", r"k=0, 0, 0.1, 0"),
         ("SIMPLE_RADIAL_FISHEYE", "48 24 18 0", "not a pinhole"),
@@ -185,6 +188,43 @@ def test_a_photo_outside_the_scene_is_refused(root, tmp_path):
     edit(root / "tiny.tsv", "photo_001.jpg", "../../../secret.jpg")
     with pytest.raises(SceneError, match=r"secret\.jpg"):
         read_scene(root)
+
+
+@pytest.mark.parametrize("name", ["a" * 300 + ".jpg", "photo.of.002.jpg", "photo 002.jpg", "Brücke in Köln.jpg"])
+def test_any_name_of_a_photo_is_read_or_refused_by_name(root, name):
+    import pycolmap
+
+    sparse = root / "dense" / "sparse"
+    model = pycolmap.Reconstruction(str(sparse))
+    next(image for image in model.images.values() if image.name == "photo_002.jpg").name = name
+    for path in sparse.iterdir():
+        path.unlink()
+    model.write_binary(str(sparse))  # in COLMAP's text format a blank ends a name
+    edit(root / "tiny.tsv", "photo_002.jpg", name)
+    if len(name) < 256:
+        photo = root / "dense/images/photo_002.jpg"
+        photo.rename(photo.with_name(name))
+        assert name in [p.name for p in read_scene(root).photos]
+    else:
+        with pytest.raises(SceneError, match=r"photo aaa.* is not in .*images; put it there"):
+            read_scene(root)
+
+
+def test_two_photos_of_one_name_are_refused(root):
+    edit(root / "dense/sparse/images.txt", "photo_002.jpg", "photo_001.jpg")
+    with pytest.raises(SceneError, match=r"images 5 and 4 are both named photo_001\.jpg|cannot be read"):
+        read_scene(root)
+
+
+def test_photos_may_be_left_out(root):
+    whole = read_scene(root)
+    (root / "dense/images/photo_004.jpg").unlink()
+    scene = read_scene(root, without={"photo_001.jpg": "torn", "nobody.jpg": "never there"}, drop_missing=True)
+    assert scene.dropped == {"photo_001.jpg": "torn", "photo_004.jpg": "photo photo_004.jpg is missing"}
+    splits = {p.name: p.split for p in whole.photos}
+    assert {p.name: p.split for p in scene.photos} == {n: s for n, s in splits.items() if n not in scene.dropped}
+    with pytest.raises(SceneError, match=r"no training photo .* were left out, .*\(torn\)"):
+        read_scene(root, without=dict.fromkeys(splits, "torn"))
 
 
 def test_a_model_cut_short_is_an_error_that_names_it(root):
@@ -275,6 +315,20 @@ def test_real_raw_photos_are_healthy_and_distorted(test_data):
     check_model(pycolmap.Reconstruction(str(test_data / "sacre_coeur" / "sparse")))
     with pytest.raises(SceneError, match=r"is distorted \(k=0\.0"):
         read_scene(test_data / "sacre_coeur")
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_the_command_that_undistorts_makes_a_scene(test_data, tmp_path):
+    raw = tmp_path / "raw photos"
+    shutil.copytree(test_data / "sacre_coeur", raw, copy_function=shutil.copyfile)
+    with pytest.raises(SceneError) as refusal:
+        read_scene(raw)
+    command = str(refusal.value).splitlines()[-1].strip()
+    assert command.startswith("python -c ")
+    subprocess.run(command.replace("python", shlex.quote(sys.executable), 1), shell=True, check=True)
+    scene = read_scene(raw)
+    assert len(scene.photos) == 8  # of 10: two have no id in the split table
 
 
 @pytest.mark.real

@@ -15,7 +15,7 @@ import resource
 import subprocess
 import sys
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from functools import cache
 from pathlib import Path
@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from forgery import edit_manifest, read_all, repack
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from rich.console import Console
@@ -50,7 +51,6 @@ from pipeline.report import Row, write_report
 from pipeline.runs import load_run
 from pipeline.scene import SceneError, read_scene
 from pipeline.segmentation import find_segmenter
-from pipeline.shards import read_shard, verify_shards
 from pipeline.status import Status, as_table
 from pipeline.study import load_study, make_study
 
@@ -103,34 +103,6 @@ def shards(tmp_path) -> Path:
     root, out = write_tiny_scene(tmp_path / "scene", photos=4, size=(16, 12)), tmp_path / "shards"
     cut_shards(root, out, downscale=1, reference_downscale=1, plan=PatchPlan(size=4), mapper=in_process)
     return out
-
-
-def edit_manifest(shards: Path, change: Callable[[dict], object]) -> None:
-    content = json.loads((shards / "manifest.json").read_text())
-    change(content)
-    (shards / "manifest.json").write_text(json.dumps(content))
-
-
-def repack(shards: Path, change: Callable[[tarfile.TarInfo, bytes], tuple[tarfile.TarInfo, bytes] | None]) -> None:
-    """Make the first tar anew, and a manifest that vouches for it: the attacker wrote both."""
-    path = shards / "shard-000000.tar"
-    with tarfile.open(path) as tar:
-        members = [(member, tar.extractfile(member).read()) for member in tar]  # type: ignore[union-attr]
-    with tarfile.open(path, "w") as tar:
-        for member, data in filter(None, (change(*pair) for pair in members)):
-            member.size = len(data) if member.isreg() else 0
-            tar.addfile(member, io.BytesIO(data))
-
-    def vouch(content: dict) -> None:
-        content["shards"][0] |= {"sha256": sha256_of(path), "bytes": path.stat().st_size}
-
-    edit_manifest(shards, vouch)
-
-
-def read_all(shards: Path) -> None:
-    for shard in verify_shards(shards).shards:
-        list(read_shard(shards, shard))
-    open_photos(shards)
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import logging
 import os
 import shutil
 import tarfile
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from PIL import Image
 from tiny_scene import write_tiny_scene
 
 from pipeline.cutting import camera_record, cut_shards, split_photos
+from pipeline.errors import CrossrayError
 from pipeline.files import sha256_of
 from pipeline.launch.tasks import in_process
 from pipeline.manifest import Manifest, ShardError, digest, read_manifest
@@ -194,6 +197,51 @@ def test_photos_smaller_than_the_downscale_are_refused(root, tmp_path):
         cut(root, tmp_path / "s", downscale=0)
     with pytest.raises(SceneError):
         cut(tmp_path / "nowhere", tmp_path / "s")
+
+
+def test_photos_that_cannot_be_used_may_be_dropped_and_are_counted(root, tmp_path, caplog):
+    splits = {p.name: p.split for p in read_scene(root).photos}
+    bad = {
+        "photo_001.jpg": (jpeg(36, 48), "36 x 48 pixels and its camera 48 x 36"),
+        "photo_003.jpg": (jpeg(48, 36)[:-900], "cannot be read"),
+        "photo_004.jpg": (None, "is missing"),
+    }
+    for name, (content, _) in bad.items():
+        replace_photo(root, content, name) if content else (root / "dense" / "images" / name).unlink()
+    with pytest.raises(CrossrayError, match=r"photo_004\.jpg"):
+        cut(root, tmp_path / "s")
+    with caplog.at_level(logging.WARNING, logger="crossray"):
+        manifest = cut(root, tmp_path / "s", on_bad_photo="drop")
+    assert "3 photos of" in caplog.text
+    assert sorted(manifest.dropped) == sorted(bad)
+    for name, (_, words) in bad.items():
+        assert words in manifest.dropped[name]
+        assert words in caplog.text
+    left = {sample.camera.name: sample.camera.split for sample in samples(tmp_path / "s")}
+    assert left == {name: split for name, split in splits.items() if name not in bad}
+    verify_shards(tmp_path / "s")
+    assert cut(root, tmp_path / "s", on_bad_photo="drop") == manifest
+
+
+def test_a_scene_of_bad_photos_alone_is_refused(root, tmp_path):
+    for path in (root / "dense" / "images").iterdir():
+        path.write_bytes(b"not a picture")
+    with pytest.raises(SceneError, match="no training photo among the 0 posed ones, 10 were left out"):
+        cut(root, tmp_path / "s", on_bad_photo="drop")
+
+
+def test_conversions_are_counted(root, tmp_path, caplog):
+    for number, mode in enumerate(("L", "CMYK", "L", "RGB")):
+        path = root / "dense" / "images" / f"photo_00{number}.jpg"
+        Image.open(path).convert(mode).save(path)
+    with caplog.at_level(logging.INFO, logger="crossray"):
+        manifest = cut(root, tmp_path / "s")
+    assert "converted to 8-bit RGB: 1 CMYK, 2 grayscale" in caplog.text
+    assert sum((Counter(shard.converted) for shard in manifest.shards), Counter()) == {"CMYK": 1, "grayscale": 2}
+    caplog.clear()
+    with caplog.at_level(logging.INFO, logger="crossray"):
+        cut(root, tmp_path / "s")
+    assert "1 CMYK, 2 grayscale" in caplog.text
 
 
 # The same bytes, whatever happens

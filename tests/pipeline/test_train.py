@@ -31,9 +31,11 @@ from pipeline.launch import run as launch
 from pipeline.launch.run import claim_run, ensure_shards, run_job
 from pipeline.launch.tasks import in_process
 from pipeline.launch.torchrun import pick_device, run_rank
+from pipeline.manifest import read_manifest
 from pipeline.masks import MaskRecord, encode_mask
 from pipeline.photos import open_photos
 from pipeline.resume import TrainingError, checkpoints
+from pipeline.scene import read_scene
 from pipeline.shards import verify_shards
 from pipeline.train import train
 from pipeline.work import Context
@@ -478,6 +480,22 @@ def test_shards_of_another_scene_are_refused(make, tmp_path):
     write_tiny_scene(tmp_path / "other", photos=5)
     job = make("nerf", over={"scene": {"path": str(tmp_path / "other")}})
     with pytest.raises(CrossrayError, match=r"cut from another scene.*scene\.shards"):
+        ensure_shards(job)
+
+
+def test_a_model_that_is_the_one_of_the_shards_is_not_read_again(make, cut, tmp_path, monkeypatch):
+    shutil.copytree(cut / "scene", tmp_path / "scene")
+    job = make("nerf", over={"scene": {"path": str(tmp_path / "scene")}})
+    read = []
+    monkeypatch.setattr(launch, "read_scene", lambda *a, **k: read.append(1) or read_scene(*a, **k))
+    assert ensure_shards(job) == read_manifest(job.shards)
+    assert not read
+    table = next((tmp_path / "scene").glob("*.tsv"))
+    table.write_text(table.read_text() + "\n")  # says the same
+    assert ensure_shards(job) == read_manifest(job.shards)
+    assert read
+    table.write_text(table.read_text().replace("val", "train"))
+    with pytest.raises(CrossrayError, match="before it changed"):
         ensure_shards(job)
 
 
