@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -53,6 +53,7 @@ from model.transient.cgnet import CGNet, transient_probability
 from model.transient.unet import UNet
 from model.transient.uvmask import UVMask
 
+Module = TypeVar("Module", bound=nn.Module)
 Transform = ReleasedTransform | CompactTransform | ClosedFormTransform
 
 COMPACT_SIZE = (64, 96)  # height and width at which the compact networks and the U-Net see a photo
@@ -114,22 +115,22 @@ class SceneModel(nn.Module):
         self.transform: Transform | None = None
         compact = spec.encoder == "compact"
         if spec.appearance == "crossray":
-            self.encoder = CompactEncoder(channels) if compact else ReleasedEncoder()
-            self.content_encoder = CompactEncoder(channels) if compact else ReleasedEncoder()
+            self.encoder = channels_last(CompactEncoder(channels)) if compact else ReleasedEncoder()
+            self.content_encoder = channels_last(CompactEncoder(channels)) if compact else ReleasedEncoder()
             self.transform = make_transform(spec)
             side = self.transform.moment_size
             self.register_buffer("running_mean", torch.zeros(1, channels))
             self.register_buffer("running_gram", torch.zeros(1, side, side))
             self.register_buffer("running_count", torch.zeros(()))
         elif spec.appearance == "code":
-            self.encoder = CompactCode() if compact else ReleasedCode()
+            self.encoder = channels_last(CompactCode()) if compact else ReleasedCode()
         elif spec.appearance == "embedding":
             self.embedding = nn.Embedding(photos, CODE)
         self.segmenter: CGNet | UNet | None = None
         self.uvmask: UVMask | None = None
         self.transient_embedding: nn.Embedding | None = None
         if spec.transient == "segmenter":
-            self.segmenter = UNet() if spec.segmenter == "unet" else CGNet()
+            self.segmenter = channels_last(UNet()) if spec.segmenter == "unet" else CGNet()
         elif spec.transient == "uvmask":
             self.uvmask = UVMask(photos)
         elif spec.transient == "uncertainty":
@@ -260,7 +261,9 @@ class SceneModel(nn.Module):
 
     def autocast(self, device: torch.device) -> AbstractContextManager:
         """bfloat16 inside the field where it pays; statistics, transform and losses stay in float32."""
-        return torch.autocast(device.type, torch.bfloat16, enabled=self.use_bfloat16)
+        # The cached copy of a weight would sum the gradients of all blocks (`in_blocks`) in bfloat16.
+        cached = device.type != "cpu"
+        return torch.autocast(device.type, torch.bfloat16, enabled=self.use_bfloat16, cache_enabled=cached)
 
     @torch.no_grad()
     def track(self, new: ContentStatistics) -> None:
@@ -515,6 +518,14 @@ def needs_other(spec: ModelSpec, weights: LossWeights) -> bool:
     return reads or (spec.appearance == "code" and weights.mode_seeking > 0)
 
 
+def as_read(spec: ModelSpec, images: list[Tensor]) -> list[Tensor]:
+    """Photos (3, h, w) at the one size at which all networks read them, as they are where there is none: what is done
+    to a step's references is then done to few pixels, and they are reduced once for all networks.
+    """
+    at_their_own = spec.encoder != "compact" or (spec.transient == "segmenter" and spec.segmenter != "unet")
+    return images if at_their_own or not images else list(at_size(images, COMPACT_SIZE))
+
+
 def make_field(spec: ModelSpec, box: Tensor) -> Field:
     """The field as `spec` wants it; `box` (2, 3) as SceneModel takes it."""
     head = spec.colour == "head"
@@ -533,6 +544,11 @@ def make_transform(spec: ModelSpec) -> Transform:
     if spec.encoder == "compact":
         return CompactTransform(spec.channels, **moments)
     return ReleasedTransform(spec.channels, **moments)
+
+
+def channels_last(network: Module) -> Module:
+    """The network with its weights in the memory format in which small convolutions are fastest."""
+    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def embed(encoder: nn.Module, images: list[Tensor]) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from model.scene_model import Batch, needs_other, needs_references
+from model.scene_model import Batch, as_read, needs_other, needs_references
 from pipeline.batches import TrainingPhotos, jitter_colours
 from pipeline.config import Job
 from pipeline.patches import Patch, patches, step_generator
@@ -55,6 +55,7 @@ class Work:
         model, size = self.job.model, self.job.patch.size
         others, references = needs_other(model, self.job.losses), needs_references(model)
         batch = self.data.batch(self.patches(step, self.context.rank), size, others, references)
+        batch = batch._replace(references=as_read(model, batch.references), others=as_read(model, batch.others))
         strength = self.job.train.colour_jitter
         if strength == 0:
             return batch

@@ -109,4 +109,9 @@ def moment(per_ray: nn.Linear | None, features: Tensor, mean: Tensor) -> Tensor:
 
 def at_size(images: list[Tensor], size: tuple[int, int]) -> Tensor:
     """Images (3, h, w) of any size as one batch (P, 3, *size), area-averaged."""
-    return torch.cat([F.interpolate(image[None], size=size, mode="area") for image in images])
+    return torch.cat([reduced(image[None], size) for image in images])
+
+
+def reduced(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """One image (1, 3, h, w) at that size."""
+    return image if image.shape[-2:] == size else F.interpolate(image, size=size, mode="area")

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 # 2_654_435_761 as the int32 with the same bits: only the low bits of a product enter the hash.
 PRIMES = (1, 2_654_435_761 - 2**32, 805_459_861)
@@ -52,8 +51,8 @@ class HashEncoding(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Features (N, L F) of points x (N, 3) in [0, 1]; no gradient flows to x."""
         index, weight = self.corners(x.detach())
-        out: Tensor = _GatherCorners.apply(self.table, index, weight)
-        return out.view(len(self.resolutions), x.shape[0], -1).permute(1, 0, 2).reshape(x.shape[0], -1)
+        out: Tensor = _GatherCorners.apply(self.table, index, weight, len(self.resolutions))
+        return out
 
     @torch.no_grad()
     def corners(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -69,6 +68,9 @@ class HashEncoding(nn.Module):
         index_at = (low_index, low_index + self.strides[:, :, None])
         weight_at = (1 - fraction, fraction)
         dense = self.num_dense
+        for term in index_at:  # each alone: & and | reach through ^, and there are fewer terms than corners
+            term[:, dense:] &= self.entries - 1
+            term[0] += self.offsets[:, None]  # a multiple of the entries: + is | here
         index = x.new_empty((8, *scaled.shape[1:]), dtype=torch.int32)
         weight = x.new_empty((8, *scaled.shape[1:]))
         for j, k in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -80,35 +82,36 @@ class HashEncoding(nn.Module):
                 torch.add(index_at[i][0, :dense], sum_yz, out=index[corner, :dense])
                 torch.bitwise_xor(index_at[i][0, dense:], hash_yz, out=index[corner, dense:])
                 torch.mul(weight_at[i][0], weight_yz, out=weight[corner])
-        index[:, dense:] &= self.entries - 1
-        index += self.offsets[:, None]
         return index.view(8, -1), weight.view(8, -1)
 
 
 class _GatherCorners(torch.autograd.Function):
-    """out[n] = sum over corners of weight * table[index], with a scatter-add backward for the table alone.
+    """Per level l and point n the sum over corners of weight * table[index], as (N, L F); the backward pass is a
+    scatter-add into the table alone.
 
-    autograd's own route (indexing) materialises (8, L N, F) twice.
+    Corner by corner and feature by feature, which on a CPU takes three quarters of embedding_bag's time, for it wants
+    the corners of a point beside each other (benchmarks/results/fast-step.json). autograd's own route (indexing)
+    materialises (8, L N, F) twice.
     """
 
     @staticmethod
-    def forward(ctx: Any, table: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+    def forward(ctx: Any, table: Tensor, index: Tensor, weight: Tensor, levels: int) -> Tensor:
         ctx.save_for_backward(index, weight)
-        ctx.table_shape = table.shape
-        return F.embedding_bag(
-            index.t().contiguous(),
-            table,
-            per_sample_weights=weight.t().contiguous().to(table.dtype),
-            mode="sum",
-        )
+        ctx.levels, ctx.rows = levels, len(table)
+        columns = [column.contiguous() for column in table.unbind(1)]
+        out = table.new_zeros(len(columns), index.shape[1])
+        for rows, share in zip(index, weight, strict=True):
+            for f, column in enumerate(columns):
+                out[f].addcmul_(column.index_select(0, rows), share)
+        return out.view(len(columns), levels, -1).permute(2, 1, 0).flatten(1)
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
         (grad,) = grad_outputs
         index, weight = ctx.saved_tensors
-        rows, features = ctx.table_shape
-        flat = index.reshape(-1).long()
-        # One flat scatter a feature: a 1-D scatter_add_ with int64 rows is the fast path on CPUs.
-        planes = grad.t().contiguous()
-        columns = [grad.new_zeros(rows).scatter_add_(0, flat, (weight * planes[f]).view(-1)) for f in range(features)]
-        return torch.stack(columns, dim=1), None, None
+        planes = grad.view(len(grad), ctx.levels, -1).permute(2, 1, 0).flatten(1)
+        columns = grad.new_zeros(len(planes), ctx.rows)
+        for rows, share in zip(index.long(), weight, strict=True):  # scatter_add_ knows no other rows
+            for column, plane in zip(columns, planes, strict=True):
+                column.scatter_add_(0, rows, share * plane)
+        return torch.stack(columns.unbind(), dim=1), None, None, None

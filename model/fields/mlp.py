@@ -57,8 +57,13 @@ class RadianceMLP(nn.Module):
         xyz: (..., 3). direction: unit, (..., 3), or anything that broadcasts: (R, 1, 3) serves all samples of
         a ray. code: (..., code_channels), likewise.
         """
+        density, bottleneck = self.density_and_bottleneck(xyz)
+        return density, self.features_at(bottleneck, direction, code)
+
+    def density_and_bottleneck(self, xyz: Tensor) -> tuple[Tensor, Tensor]:
+        """Density (...,) and what no direction changes of a point, (..., width)."""
         h = self.trunk(xyz)
-        return self.density_at(h), self.features_at(self.bottleneck(h), direction, code)
+        return self.density_at(h), self.bottleneck(h)
 
     def density_at(self, h: Tensor) -> Tensor:
         """Density (...,) from the trunk's output (..., width)."""

@@ -10,7 +10,7 @@ from copy import deepcopy
 import torch
 from torch import Tensor, nn
 
-from model.fields.base import Field, Level, Placed, Rays, at_least_float32, linear, points
+from model.fields.base import Field, Level, Placed, Rays, at_least_float32, in_blocks, linear, points
 from model.fields.mlp import RadianceMLP
 from model.methods import CODE, MLPSpec
 from model.sampling import refine, stratified
@@ -58,21 +58,21 @@ class NeRFField(Field):
 
         u = None if generator is None else torch.rand(count, num_fine, device=device, generator=generator)
         t = refine(t, coarse.weights, num_fine, u)
-        h = self.fine.trunk(points(rays, t))
-        density, deltas = self.noisy(self.fine.density_at(h), generator), intervals(t)
-        weights = render_weights(density, deltas)
-        return Placed(rays.directions, t, deltas, density, weights, self.fine.bottleneck(h), [coarse], {})
+        density, inner = in_blocks(self.fine.density_and_bottleneck, points(rays, t))
+        density, deltas = self.noisy(density, generator), intervals(t)
+        return Placed(rays.directions, t, deltas, density, render_weights(density, deltas), inner, [coarse], {})
 
     def coarse_level(self, rays: Rays, t: Tensor, generator: torch.Generator | None) -> Level:
         """The coarse MLP at distances t (R, S)."""
-        density, features = self.coarse(points(rays, t), rays.directions[:, None])
+        density, features = in_blocks(self.coarse, points(rays, t), rays.directions[:, None])
         weights = render_weights(self.noisy(density, generator), intervals(t))
         return Level(t, weights, at_least_float32(features))
 
     def seen(self, inner: Tensor, directions: Tensor, code: Tensor | None) -> tuple[Tensor, None]:
         """See Field. There is no background: light that meets nothing is lost."""
         code = None if code is None else code[:, None]
-        features = at_least_float32(self.fine.features_at(inner, directions[:, None], code))
+        (features,) = in_blocks(lambda *x: (self.fine.features_at(*x),), inner, directions[:, None], code)
+        features = at_least_float32(features)
         return features if self.fold is None else self.fold(features), None
 
     def folded(self, A: Tensor, shift: Tensor) -> NeRFField:

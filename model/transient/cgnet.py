@@ -59,8 +59,14 @@ def transient_probability(logit: Tensor, size: tuple[int, int], seen: tuple[int,
     is the size (h, w) of what it read; without it, 8 times the logit's, which is the same for multiples of 8.
     """
     seen = seen or (STRIDE * logit.shape[2], STRIDE * logit.shape[3])
-    enlarged = functional.interpolate(logit, size=seen, mode="bilinear", align_corners=False)
-    return functional.interpolate(enlarged.sigmoid(), size=size, mode="bilinear", align_corners=False)
+    return resized(resized(logit, seen).sigmoid(), size)
+
+
+def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """x (B, C, h, w) at that size, bilinear."""
+    if x.shape[-2:] == size:
+        return x
+    return functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
 
 
 class NormAct(nn.Sequential):
