@@ -430,13 +430,21 @@ class SceneModel(nn.Module):
         Args:
             code: (1, CODE) appearance, for a field that reads one.
         """
-        parts = []
+        whole: Rendering | None = None
+        done = 0
         for march in self.marches(rays, chunk, samples, code):
             level = march.levels[-1]
+            del march
             if self.fuses_points:
                 level = level.with_constant()
-            parts.append(Rendering(*(at_least_float32(x) for x in level.composite())))
-        return Rendering(*(torch.cat(x) for x in zip(*parts, strict=True)))
+            part = Rendering(*(at_least_float32(x) for x in level.composite()))
+            del level  # a chunk's samples are gone before the next one's come
+            whole = whole or Rendering(*(x.new_empty(len(rays.near), *x.shape[1:]) for x in part))
+            for out, x in zip(whole, part, strict=True):
+                out[done : done + len(x)] = x
+            done += len(part.depth)
+        assert whole is not None
+        return whole
 
     @torch.no_grad()
     def point_features(self, rays: Rays, samples: tuple[int, int] | None = None) -> Tensor:
@@ -466,6 +474,7 @@ class SceneModel(nn.Module):
             with self.autocast(rays.near.device):
                 march = self.field.march(part, samples=samples, codes=codes)
             yield march  # outside: a generator's context would stay open while its caller composites
+            del march
 
     def picture(self, placed: Placed, code: Tensor, transient: Tensor | None) -> Tensor:
         """rgb (R, 3) at placed samples, with gradient to the codes (1, .): what a code is fitted with."""

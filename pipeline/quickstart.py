@@ -36,8 +36,12 @@ from pipeline.truth import mask_iou
 
 log = logging.getLogger("crossray")
 
-TRAIN_SECONDS = 100.0
+TRAIN_SECONDS = 90.0
 SIZE = 128  # long side of a photo, pixels
+MODELS = {  # one field; T in closed form is the best of the landmark's ablation (benchmarks/results/ablation.md)
+    "crossray": {"field": "hash", "transform": "closed_form"},
+    "nerf": {"field": "hash"},
+}
 PHOTOS = {"train": 144, "val": 8, "test": 8}
 TITLE = "The landmark without its tourists"
 SCORES = {
@@ -67,7 +71,7 @@ def quickstart_job(out: Path, method: str, ranks: int, seconds: float) -> Job:
             "runs": str(out / "runs"),
             "ranks": ranks,
             "device": "cpu",
-            "model": {"field": "hash"},
+            "model": MODELS[method],
             "train": {"seconds": seconds},
         }
     )
@@ -95,7 +99,7 @@ def run_quickstart(
     photos = photos or PHOTOS
     console.rule("1/4  photos and shards")
     ranks = max(1, torch.multiprocessing.cpu_count())
-    ours, nerf = (quickstart_job(out, method, ranks, seconds) for method in ("crossray", "nerf"))
+    ours, nerf = (quickstart_job(out, method, ranks, seconds) for method in MODELS)
     with tasks() as mapper:
         write_landmark(out / "scene", **photos, size=size, mapper=shown(mapper, "taking photos"))
         cut_shards(
@@ -247,7 +251,7 @@ def report_again(out: Path, path: Path) -> Path:
     """
     try:
         summary = json.loads((out / "summary.json").read_text())
-        ours, nerf = (quickstart_job(out, m, summary["ranks"], summary["train_seconds"]) for m in ("crossray", "nerf"))
+        ours, nerf = (quickstart_job(out, m, summary["ranks"], summary["train_seconds"]) for m in MODELS)
         scores, lead = scores_of(summary), lead_of(summary)
     except (ValueError, KeyError, TypeError) as error:
         raise CrossrayError(
