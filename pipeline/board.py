@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ class Board:
         self.folder = folder
         self.purge_from: int | None = step + 1
         self.writer: SummaryWriter | None = None
+        threading.excepthook = told_once
 
     def write(self, what: Callable[..., None], step: int, *args: Any) -> None:
         """`what(writer, step, *args)`."""
@@ -52,6 +54,12 @@ class Board:
                 self.writer.close()
         except OSError as error:
             log.warning("%s: the last steps cannot be written (%s)", self.folder, error)
+
+
+def told_once(error: threading.ExceptHookArgs) -> None:
+    """An error that ended a thread; not that of a writer whose disk takes nothing: the next write raises it again."""
+    if not (issubclass(error.exc_type, OSError) and type(error.thread).__module__.startswith("tensorboard")):
+        threading.__excepthook__(error)
 
 
 def write_scalars(
