@@ -1,6 +1,6 @@
 """How the fast preset's training step grows: with photos, ranks, rays and the size of the photos.
 
-    python benchmarks/growth.py [--rounds 11] [--out benchmarks/results/growth.json]
+    python benchmarks/growth.py [--rounds 7] [--out benchmarks/results/growth.json]
 
 (a) 50, 500 and 5,000 training photos: the slowest step within 10 % of the fastest.
 (b) 2 ranks against 1: at least 1.9 times the patches a second. Beside it what the machine itself allows: two trainings
@@ -206,7 +206,7 @@ def as_record(row: Row) -> dict[str, Any]:
 def main() -> None:
     """Measure, print, record."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=11)
+    parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     where = provenance()

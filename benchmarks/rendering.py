@@ -198,7 +198,7 @@ def picture_memory(
     """MiB at most while a picture (width, height) is rendered, above what was held before, and of what comes out."""
     timing = make_timing(mapping)
     job = method_job(timing, method)
-    set_up_torch(job, device)  # freed memory is kept, as in an evaluation
+    set_up_torch(job, device)
     model = untrained(job, device, False)
     appearance = model.encode([reference_photo(timing, device)])
     held = torch.cuda.memory_allocated(device) / MIB if device.type == "cuda" else 0.0

@@ -50,7 +50,7 @@ from pipeline.pictures import decode_png
 from pipeline.provenance import provenance
 from pipeline.timing_measure import summarised
 
-ROUNDS = 3
+ROUNDS = 2
 SETTLED = 4.0  # seconds of training after which memory is looked at
 GROWTH = 0.1  # the bar
 ENDLESS = 10**6  # steps

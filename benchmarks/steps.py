@@ -7,9 +7,9 @@ on the GPU that is there. The limit is the step's matrix products and convolutio
 product. Bars, on a CPU: at most 1.3 times the limit in float32, 2 times in bfloat16, and no more memory than the 3.1 GB
 that the released code takes.
 
-What stands between is shown by leaving out, one at a time, what was done about it: blocks of points that stay in the
-cache (`model.fields.base.in_blocks`), and memory that is kept when it is freed (`pipeline.memory`). Each row is a
-process of its own, which measures the peak before and after its steps. Exit status 1 if a bar is missed.
+What stands between is mostly memory that the system hands out page by page; a row without the blocks of points that
+stay in the cache (`model.fields.base.in_blocks`) shows how much. Each row is a process of its own, which measures the
+peak before and after its steps. Exit status 1 if a bar is missed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from typing import Any
 
 import torch
 
-import pipeline.train
 from model.fields import base
 from pipeline.files import atomic_write
 from pipeline.provenance import device_name, provenance
@@ -37,7 +36,7 @@ from pipeline.work import Context
 BARS = {"float32": 1.3, "bfloat16": 2.0}  # times the limit
 MEMORY = 3.1e9  # bytes
 PHOTOS = 64
-WAYS = ("as it is", "all points at once", "freed memory given back", "neither")
+WAYS = ("as it is", "all points at once")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -74,10 +73,8 @@ def in_a_process(precision: str, way: str, seconds: float) -> dict[str, Any]:
 
 def measured(precision: str, way: str, seconds: float) -> dict[str, Any]:
     """A row: the step in one precision, in one of WAYS."""
-    if way in ("all points at once", "neither"):
+    if way == "all points at once":
         base.BLOCK_POINTS = 2**60
-    if way in ("freed memory given back", "neither"):
-        pipeline.train.keep_freed_memory = lambda: None
     timing = make_timing({"threads": 1, "training": {"photos": PHOTOS}})
     job = with_precision(training_job(timing, "crnerf"), precision)
     meter = Meter(DEVICE, seconds)

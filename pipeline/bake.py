@@ -39,7 +39,7 @@ from pipeline.files import atomic_file, atomic_write, sha256_of
 from pipeline.manifest import ShardError
 from pipeline.metrics import to_8bit
 from pipeline.photos import Photos
-from pipeline.pictures import to_rgb
+from pipeline.pictures import FORMATS, reason, to_rgb
 from pipeline.provenance import provenance
 from pipeline.render import (
     check_reference,
@@ -179,12 +179,12 @@ def read_picture(path: Path) -> np.ndarray:
         CrossrayError: it cannot be read.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=FORMATS) as image:
             return to_rgb(image, str(path))
     except ShardError:
         raise
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
-        raise CrossrayError(f"{path}: cannot be read as an image ({error})") from error
+    except Exception as error:  # Pillow's decoders raise whatever they meet
+        raise CrossrayError(f"{path}: cannot be read as an image ({reason(error)})") from error
 
 
 def fixed_statistics(model: SceneModel, photos: Photos) -> tuple[ContentStatistics | None, str]:

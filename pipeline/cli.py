@@ -3,6 +3,7 @@ or pycolmap can train from shards."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
@@ -41,10 +42,31 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except (CrossrayError, OSError) as error:
+        text = str(error) if isinstance(error, CrossrayError) else told(error)
         Console(stderr=True).print(
-            f"[bold red]crossray:[/] {escape(plain(str(error)))}", highlight=False, soft_wrap=True, markup=True
+            f"[bold red]crossray:[/] {escape(plain(text))}", highlight=False, soft_wrap=True, markup=True
         )
         sys.exit(2)
+
+
+ADVICE = {
+    errno.ENOSPC: "make room, and run the same command again",
+    errno.EDQUOT: "make room, and run the same command again",
+    errno.EROFS: "name a folder that can be written",
+    errno.EACCES: "name one that may be read and written",
+    errno.ENOTDIR: "a file stands where a folder is needed; name another one",
+    errno.EISDIR: "a folder stands where a file is needed; name another one",
+    errno.EEXIST: "a file stands where a folder is needed; name another one",
+    errno.ENOENT: "is the name right?",
+    errno.ENAMETOOLONG: "name a shorter one",
+}
+
+
+def told(error: OSError) -> str:
+    """What the system refused, where, and what to do."""
+    where = f"{error.filename}: " if error.filename else ""
+    advice = ADVICE.get(error.errno or 0)
+    return f"{where}{error.strerror or error}{f'; {advice}' if advice else ''}"
 
 
 @app.command()
@@ -245,7 +267,7 @@ def shard(
     try:
         plan = PatchPlan(**chosen)
     except ValidationError as error:
-        raise CrossrayError("\n".join(f"--set {explain(e)}" for e in error.errors())) from None
+        raise CrossrayError("\n".join(f"--set {explain(e, PatchPlan)}" for e in error.errors())) from None
     with ray_tasks() as mapper:
         manifest = cut_shards(
             scene,

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import yaml
 
 from pipeline.checkpoint import Checkpoint, committed, read_checkpoint
-from pipeline.config import flatten
+from pipeline.config import read_saved
 from pipeline.errors import CrossrayError
 from pipeline.record import Losses, read_losses
 
@@ -61,7 +60,7 @@ def read_job(run: Path) -> dict[str, Any]:
     path = run / "job.yaml"
     if not path.is_file():
         raise CrossrayError(f"{run} is not a run: it has no job.yaml")
-    return flatten(yaml.safe_load(path.read_text()))
+    return read_saved(path)
 
 
 def compare_losses(a: Path, b: Path) -> list[Finding]:

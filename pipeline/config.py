@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from model.losses import PRESETS, LossWeights, check_weights
 from model.methods import AXES, FUSED_AT, METHODS, ModelSpec, check_spec, smallest_side
 from pipeline.errors import CrossrayError
-from pipeline.files import atomic_write
+from pipeline.files import atomic_write, resolved
 from pipeline.patches import PatchPlan
 
 MOST_VALUES = 10_000  # of a job file
+BRANCHES = ("int", "constrained-int", "literal['auto']")  # of unions: what pydantic names as if they were keys
 UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 # Keys of `train` that decide what is kept and shown, not what is learned: they may change between two starts of a run.
@@ -38,6 +39,13 @@ class Section(BaseModel):
     """A part of a job file; unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _paths_that_can_be(self) -> Section:
+        for name, value in self:
+            if isinstance(value, Path) and "\0" in str(value):
+                raise ValueError(f"{name}: {str(value)!r} holds a NUL character, which no path can")
+        return self
 
 
 class SceneJob(Section):
@@ -186,7 +194,7 @@ class Job(Section):
         """The scene's shards at the job's downscale."""
         scene = self.scene
         masks = "-masks" if self.model.transient == "fixed" else ""  # shards with masks are another set of shards
-        return scene.shards or self.runs.parent / "shards" / f"{scene.path.resolve().name}-R{scene.downscale}{masks}"
+        return scene.shards or self.runs.parent / "shards" / f"{resolved(scene.path).name}-R{scene.downscale}{masks}"
 
 
 RECIPES: dict[str, dict[str, Any]] = {
@@ -239,14 +247,34 @@ def load_job(path: Path, settings: Sequence[str] = ()) -> Job:
     return make_job(raw, settings, source=str(path))
 
 
+class PlainLoader(yaml.SafeLoader):
+    """YAML without what would be lost or could grow without end: a key that is there twice, and `<<`."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """As SafeLoader's; ConstructorError for such a key."""
+        seen = set()
+        for key, _ in node.value:
+            if key.tag == "tag:yaml.org,2002:merge":
+                raise yaml.constructor.ConstructorError(None, None, "merge keys (<<) are not read", key.start_mark)
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} is there twice; keep one", key.start_mark
+                )
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else id(key))
+        return super().construct_mapping(node, deep)
+
+
 def parse_yaml(text: str) -> Any:
     """A YAML text as plain values.
 
     Raises:
-        yaml.YAMLError: it is none.
+        yaml.YAMLError: it is none, or has what `PlainLoader` refuses.
         ValueError: it stands for more values than a job has; a few lines of aliases can stand for billions.
     """
-    value = yaml.safe_load(text)
+    try:
+        value = PlainLoader(text).get_single_data()
+    except (RecursionError, LookupError, AttributeError, TypeError) as error:  # of tags and depths not foreseen there
+        raise ValueError(f"{type(error).__name__}: {error}") from error
     left, todo = MOST_VALUES, [value]
     while todo:
         node = todo.pop()
@@ -299,6 +327,21 @@ def check_training(job: Job) -> None:
 def save_job(job: Job, path: Path) -> None:
     """The resolved job: every key with its value."""
     atomic_write(path, yaml.safe_dump(job.model_dump(mode="json"), sort_keys=False))
+
+
+def read_saved(path: Path) -> dict[str, Any]:
+    """The `job.yaml` of a run as {"a.b": value}, without a look at what the keys mean.
+
+    Raises:
+        JobError: it is damaged.
+    """
+    try:
+        raw = parse_yaml(path.read_text())
+    except (OSError, yaml.YAMLError, ValueError) as error:
+        raise JobError(f"{path} is damaged ({error}): restore it, or remove that run") from error
+    if not isinstance(raw, dict):
+        raise JobError(f"{path} is damaged (it is not a mapping): restore it, or remove that run")
+    return flatten(raw)
 
 
 def with_defaults(raw: dict[str, Any]) -> dict[str, Any]:
@@ -383,12 +426,12 @@ def as_dict(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def explain(error: Any, schema: type[BaseModel] = Job) -> str:
+def explain(error: Any, schema: type = Job) -> str:
     """One pydantic error of a job file with this schema as `key: what is wrong, nearest right name`."""
     location = [str(part) for part in error["loc"]]
     if not location:
         return error["msg"].removeprefix("Value error, ")
-    if location[-1] in ("int", "literal['auto']") and error["type"] not in UNKNOWN:  # branches of a union, not keys
+    if location[-1] in BRANCHES and error["type"] not in UNKNOWN:
         location.pop()
     key = ".".join(location)
     if error["type"] in UNKNOWN:
@@ -400,9 +443,9 @@ def explain(error: Any, schema: type[BaseModel] = Job) -> str:
     return f"{key}: {error['msg'][:1].lower()}{error['msg'][1:]} (got {error['input']!r})"
 
 
-def keys_at(location: list[str], schema: type[BaseModel] = Job) -> list[str]:
+def keys_at(location: list[str], schema: type = Job) -> list[str]:
     """The valid keys of the section at `location`."""
-    whole = schema.model_json_schema()
+    whole = TypeAdapter(schema).json_schema()
     node = whole
     for part in location:
         node = resolve(node.get("properties", {}).get(part, {}), whole)

@@ -19,7 +19,7 @@ import numpy as np
 from filelock import FileLock
 from pydantic import ValidationError
 
-from pipeline.files import atomic_file, atomic_write, sha256_of
+from pipeline.files import atomic_file, atomic_write, resolved, sha256_of
 from pipeline.manifest import (
     FORMAT_VERSION,
     MANIFEST,
@@ -91,8 +91,9 @@ def cut_shards(
     if downscale < 1 or reference_downscale < 1:
         raise ShardError(f"downscale {downscale}, reference_downscale {reference_downscale}: both must be at least 1")
     dropping = on_bad_photo == "drop"
+    source = fingerprint(scene_root)
     scene = read_scene(scene_root, drop_missing=dropping)
-    out = Path(out).resolve()
+    out = resolved(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
         lock = FileLock(out / ".lock")
@@ -102,13 +103,22 @@ def cut_shards(
     try:
         if dropping:
             scene = without_bad_photos(scene, out, downscale, reference_downscale, mapper)
-        return _cut(scene, out, downscale, reference_downscale, plan, mapper)
+        return _cut(scene, source, out, downscale, reference_downscale, plan, mapper)
     finally:
         lock.release()
 
 
 def specs_of(scene: Scene, out: Path, downscale: int, reference_downscale: int) -> list[ShardSpec]:
-    """A task's work each."""
+    """A task's work each.
+
+    Raises:
+        ShardError: two photos share a mask.
+    """
+    owners: dict[Path, str] = {}
+    for photo in scene.photos:
+        mask = mask_path(scene, photo)
+        if mask and owners.setdefault(mask, photo.name) != photo.name:
+            raise ShardError(f"{mask} would be the mask of {owners[mask]} and of {photo.name}: rename one of them")
     return [
         ShardSpec(out, i, photos, tuple(mask_path(scene, p) for p in photos), downscale, reference_downscale)
         for i, photos in enumerate(split_photos(scene.photos))
@@ -141,7 +151,7 @@ def find_bad_photos(spec: ShardSpec) -> dict[str, str]:
 
 
 def _cut(
-    scene: Scene, out: Path, downscale: int, reference_downscale: int, plan: PatchPlan, mapper: Mapper
+    scene: Scene, source: str, out: Path, downscale: int, reference_downscale: int, plan: PatchPlan, mapper: Mapper
 ) -> Manifest:
     summary = scene_record(scene)
     _refuse_other_content(out, summary, downscale, reference_downscale)
@@ -157,6 +167,8 @@ def _cut(
     for path in out.iterdir():
         if SHARD_FILE.fullmatch(path.name) and path.name not in wanted:
             path.unlink()
+    if fingerprint(scene.root) != source:
+        raise ShardError(f"{scene.root}: the model or the split table changed while shards were cut; cut again")
     manifest = Manifest(
         scene=summary,
         downscale=downscale,
@@ -166,7 +178,7 @@ def _cut(
         patch_plan=plan_record(plan, scene, downscale),
         libraries=library_versions(),
         dropped=scene.dropped,
-        source=fingerprint(scene.root),
+        source=source,
         splits=dict(sorted(Counter(photo.split for photo in scene.photos).items())),
     )
     text = manifest.model_dump_json(indent=1) + "\n"

@@ -50,6 +50,13 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def resolved(path: Path) -> Path:
+    """The absolute path without links; links in a circle stay as they are, where `Path.resolve` of Python before 3.13
+    raises RuntimeError.
+    """
+    return Path(os.path.realpath(path))
+
+
 def sha256_of(path: Path) -> str:
     """The hexadecimal SHA-256 of a file, read in pieces."""
     with path.open("rb") as file:

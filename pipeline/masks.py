@@ -26,7 +26,7 @@ from PIL.PngImagePlugin import PngInfo
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.errors import CrossrayError
-from pipeline.files import atomic_write, sha256_of
+from pipeline.files import atomic_write, resolved, sha256_of
 from pipeline.manifest import ShardError
 from pipeline.pictures import decode_photo
 from pipeline.scene import Scene, ScenePhoto, read_scene
@@ -208,7 +208,7 @@ def mask_photo(batch: MaskBatch, photo: ScenePhoto) -> MaskResult:
         }
     except OSError as error:
         raise MaskError(f"photo {photo.name} cannot be masked: {error}") from error
-    if source and source.resolve() == path.resolve():
+    if source and resolved(source) == resolved(path):
         raise MaskError(f"{path} is what is to be copied there; masks that are there are used as they are")
     there = read_mask(path)
     if there and there[0].pixels == pixels_hash(there[1]):
@@ -243,7 +243,7 @@ def check_names(folder: Path, photos: Sequence[ScenePhoto]) -> None:
     owners: dict[Path, str] = {}
     for photo in photos:
         path = mask_file(folder, photo)
-        if ".." in Path(photo.name).parts or not path.parent.resolve().is_relative_to(folder.resolve()):
+        if ".." in Path(photo.name).parts or not resolved(path.parent).is_relative_to(resolved(folder)):
             raise MaskError(f"photo {photo.name}: its mask would lie outside {folder}; rename the photo in the model")
         owner = owners.setdefault(path, photo.name)
         if owner != photo.name:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import io
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
+from PIL.TiffImagePlugin import TiffImageFile
 
 from pipeline.manifest import ShardError
 from pipeline.scene import ScenePhoto
 
 LANCZOS, BILINEAR = Image.Resampling.LANCZOS, Image.Resampling.BILINEAR
+Image.init()
+# Not EPS, for which Pillow would run a program.
+READ = ("JPEG", "PNG", "TIFF", "WEBP", "GIF", "BMP", "PPM", "JPEG2000", "AVIF")
+FORMATS = tuple(name for name in READ if name in Image.OPEN)
 KINDS = {"1": "grayscale", "L": "grayscale", "LA": "grayscale with alpha", "RGBA": "RGB with alpha", "P": "palette"}
 
 
@@ -23,35 +28,66 @@ def decode_photo(data: bytes, photo: ScenePhoto) -> np.ndarray:
     """
     where = f"photo {photo.name}"
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
             if image.size != (photo.width, photo.height):
                 raise ShardError(
                     f"{where} has {image.width} x {image.height} pixels and its camera {photo.width} x "
                     f"{photo.height}: use the photos that the model was made from"
                 )
             return to_rgb(image, where)
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
-        raise ShardError(f"{where} cannot be read ({error}): replace it, or take it out of the split table") from error
+    except ShardError:
+        raise
+    except Exception as error:  # Pillow's decoders raise whatever they meet: OSError, RuntimeError, AttributeError, ...
+        raise ShardError(
+            f"{where} cannot be read ({reason(error)}): replace it, or take it out of the split table"
+        ) from error
+
+
+def reason(error: Exception) -> str:
+    """What Pillow found wrong with a file."""
+    return "no picture, or cut off at its start" if isinstance(error, UnidentifiedImageError) else str(error)
 
 
 def conversion(data: bytes) -> str | None:
     """What a photo is that `decode_photo` has to convert, such as CMYK; None for 8-bit RGB."""
-    with Image.open(io.BytesIO(data)) as image:
+    with Image.open(io.BytesIO(data), formats=FORMATS) as image:
         if image.mode.startswith("I;16"):
             return "16-bit grayscale"
-        return None if image.mode == "RGB" else KINDS.get(image.mode, image.mode)
+        kind = KINDS.get(image.mode, image.mode)
+        if bits(image, data) == 16:
+            return f"16-bit {kind}"
+        return None if image.mode == "RGB" else kind
+
+
+def bits(image: Image.Image, data: bytes) -> int:
+    """Of a channel in the file, where Pillow has made 8 of 16 by itself."""
+    if image.format == "PNG":
+        return data[24]
+    return max(image.tag_v2.get(258, (8,))) if isinstance(image, TiffImageFile) else 8
 
 
 def decode_mask(data: bytes, photo: ScenePhoto) -> np.ndarray:
     """The mask as uint8 (h, w), in whatever size it is stored."""
     where = f"the mask of photo {photo.name}"
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+            if not same_aspect(image.size, (photo.width, photo.height)):
+                raise ShardError(
+                    f"{where} has {image.width} x {image.height} pixels, which is not the shape of the photo's "
+                    f"{photo.width} x {photo.height}: make it again"
+                )
             if image.mode.startswith("I;16"):
                 return _to_8_bits(image)
             return np.asarray(image.convert("L"))
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
-        raise ShardError(f"{where} cannot be read ({error})") from error
+    except ShardError:
+        raise
+    except Exception as error:  # as above
+        raise ShardError(f"{where} cannot be read ({reason(error)}): make it again, or remove it") from error
+
+
+def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
+    """Whether sizes (width, height) are one shape, but for rounding a side by up to a pixel."""
+    return abs(a[0] * b[1] - a[1] * b[0]) <= max(b) + max(a)
 
 
 def to_rgb(image: Image.Image, where: str) -> np.ndarray:

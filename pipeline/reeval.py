@@ -36,6 +36,7 @@ from pipeline.evaluate import (
     score_views,
     update_best,
 )
+from pipeline.files import resolved
 from pipeline.protocol import check_protocol, parse_protocol
 from pipeline.runs import job_of
 
@@ -155,7 +156,7 @@ def find_runs(reeval: ReevalJob) -> list[Path]:
             raise CrossrayError(f"runs: {pattern} is not a run: it has no job.yaml")
         if not hits and reeval.every is None:
             raise CrossrayError(f"runs: nothing matches {pattern} (a run is a folder with a job.yaml)")
-        found |= {path.resolve(): path for path in hits if path.resolve() not in found}
+        found |= {resolved(path): path for path in hits if resolved(path) not in found}
     return list(found.values())
 
 

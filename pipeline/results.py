@@ -21,6 +21,7 @@ from model.methods import METHODS
 from pipeline.config import BOOKKEEPING, Job, as_dict, flatten, make_job
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import METRICS as METRICS_FILE
+from pipeline.files import resolved
 from pipeline.protocol import parse_protocol
 from pipeline.records import ELSEWHERE, Budget, Design, Other, Results, Score, Source, Timed
 from pipeline.runs import job_of
@@ -228,7 +229,7 @@ def score_of(about: Trainee, protocol: str, evaluated: Evaluated, source: Source
         settings = (*settings, f"statistics={evaluated.statistics}")
     usual = usual_job(design.method, job.model.field).patch
     return Score(
-        scene=job.scene.path.name or job.scene.path.resolve().name,
+        scene=job.scene.path.name or resolved(job.scene.path).name,
         protocol=protocol,
         meaning=meaning,
         design=design,

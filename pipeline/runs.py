@@ -10,7 +10,7 @@ from model.scene_model import SceneModel
 from pipeline.checkpoint import Checkpoint, CheckpointError, committed, folder_name, latest_checkpoint, read_checkpoint
 from pipeline.config import Job, load_job
 from pipeline.errors import CrossrayError
-from pipeline.memory import keep_freed_memory
+from pipeline.files import resolved
 from pipeline.photos import Photos, open_photos
 
 
@@ -22,7 +22,7 @@ def job_of(run: Path) -> Job:
     """
     if not (run / "job.yaml").is_file():
         raise CrossrayError(f"{run} is not a run: it has no job.yaml")
-    job, folder = load_job(run / "job.yaml"), run.resolve()
+    job, folder = load_job(run / "job.yaml"), resolved(run)
     scene = job.scene.model_copy(update={"shards": job.shards})
     return job.model_copy(update={"runs": folder.parent, "name": folder.name, "scene": scene})
 
@@ -47,7 +47,6 @@ def checkpoint_of(run: Path, step: int | None = None) -> Checkpoint:
 def model_of(job: Job, checkpoint: Checkpoint, device: torch.device | None = None) -> SceneModel:
     """A checkpoint's model in evaluation mode; by default on the GPU that this process has, if the job wants one."""
     torch.backends.cudnn.allow_tf32 = False  # as in training
-    keep_freed_memory()
     device = device or torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
     box = torch.zeros(2, 3)  # the scene's box is one of its buffers
     model = SceneModel(job.model, box, checkpoint.meta["photos"]).to(device).requires_grad_(False)

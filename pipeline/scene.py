@@ -27,10 +27,11 @@ import numpy as np
 
 from pipeline.colmap import import_pycolmap
 from pipeline.errors import CrossrayError
-from pipeline.files import sha256_of
+from pipeline.files import resolved, sha256_of
 
 SPLITS = ("train", "val", "test")
 MODEL_FILES = ("cameras", "images", "points3D")
+POSES = ("frames", "rigs")  # newer models have their poses in these
 # Models whose parameters beyond focal lengths and centre are a distortion that vanishes at 0.
 PINHOLE_AT_ZERO = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FAR = 5.0  # the largest far bound of a scene, in scene units
@@ -89,7 +90,7 @@ def read_scene(
         SceneError: no model, no photos, two photos of one name, a camera that is not an undistorted pinhole, a
             degenerate model (`check_model`), several split tables, or a photo whose file is missing.
     """
-    root = Path(root).resolve()
+    root = resolved(root)
     if not root.is_dir():
         raise SceneError(f"{root}: no such folder; a scene is a folder with photos and a COLMAP model")
     folder, model = find_model(root)
@@ -106,9 +107,10 @@ def read_scene(
     photo_folder = find_photo_folder(root, folder)
     missing = [n for n in kept if not is_photo(photo_folder, n)]
     if missing and not drop_missing:
+        outside = is_file(photo_folder / missing[0]) and ", for it is a link that leads out of it"
         raise SceneError(
-            f"photo {missing[0]} of the model in {folder} is not in {photo_folder}; put it there, take it out of the "
-            "split table, or let scene.on_bad_photo: drop leave it out"
+            f"photo {missing[0]} of the model in {folder} is not in {photo_folder}{outside or ''}; put it there, take "
+            "it out of the split table, or let scene.on_bad_photo: drop leave it out"
         )
     dropped |= {n: f"photo {n} is missing" for n in missing}
     images = [by_name[n] for n in left_over(root, splits, dropped)]
@@ -184,11 +186,14 @@ def measure(
     units, from `points` (P, 3) and world-to-camera `poses` (3, 4) in COLMAP units.
 
     Raises:
-        SceneError: as `depth_bounds`.
+        SceneError: as `depth_bounds`, or sizes that float32 cannot hold.
     """
     bounds = [depth_bounds(points, w2c, name) for w2c, name in zip(poses, names, strict=True)]
     scale = float(np.float32(max(far for _, far in bounds)) / FAR)
-    return bounds, scale, np.percentile(points / scale, [1, 99], axis=0).astype(np.float32)
+    box = np.percentile(points / scale, [1, 99], axis=0).astype(np.float32)
+    if not (np.isfinite(scale) and np.isfinite(box).all()):
+        raise SceneError("the COLMAP model has points so far away that its size is not a number: reconstruct again")
+    return bounds, scale, box
 
 
 def depth_bounds(points: np.ndarray, w2c: np.ndarray, name: str) -> tuple[float, float]:
@@ -250,7 +255,7 @@ def read_splits(table: Path, posed: dict[str, Any]) -> dict[str, str]:
     """
     try:
         with table.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, delimiter="\t")
+            reader = csv.DictReader(file, delimiter="\t", quoting=csv.QUOTE_NONE)
             lacking = {"filename", "id", "split"} - set(reader.fieldnames or ())
             rows = [(number, row) for number, row in enumerate(reader, start=2)]
     except (ValueError, csv.Error) as error:
@@ -260,7 +265,8 @@ def read_splits(table: Path, posed: dict[str, Any]) -> dict[str, str]:
     splits: dict[str, str] = {}
     without_id = 0
     for number, row in rows:
-        name, split = (row["filename"] or "").strip(), (row["split"] or "").strip()
+        name, split = row["filename"] or "", (row["split"] or "").strip()
+        name = name if name in posed else name.strip()
         if not (row["id"] or "").strip():
             without_id += 1
             continue
@@ -329,9 +335,9 @@ def fingerprint(root: Path) -> str:
     table. The same one, the same scene; it takes no reading of the model, which for 5,000 photos is a minute
     (benchmarks/results/start.json).
     """
-    root = Path(root).resolve()
+    root = resolved(root)
     table = find_table(root)
-    files = [f for folder in model_folders(root) for stem in MODEL_FILES for f in folder.glob(f"{stem}.*")]
+    files = [f for folder in model_folders(root) for stem in (*MODEL_FILES, *POSES) for f in folder.glob(f"{stem}.*")]
     hashes = [(f.relative_to(root).as_posix(), sha256_of(f)) for f in sorted([*files, *([table] if table else [])])]
     return hashlib.sha256(repr(hashes).encode()).hexdigest()
 
@@ -368,7 +374,7 @@ def is_photo(folder: Path, name: str) -> bool:
 
 def is_inside(folder: Path, name: str) -> bool:
     return (
-        "\0" not in name and not Path(name).is_absolute() and (folder / name).resolve().is_relative_to(folder.resolve())
+        "\0" not in name and not Path(name).is_absolute() and resolved(folder / name).is_relative_to(resolved(folder))
     )
 
 
@@ -383,9 +389,9 @@ def check_model(model: Any, images: list[Any] | None = None) -> None:
     neither tells.
 
     Raises:
-        SceneError: no 3-D points; a focal length outside 0.1 to 10 times the longer side; a photo that sees
-        no point; or
-            most cameras in one spot of a scene that is hundreds of times as large.
+        SceneError: no 3-D points; a focal length outside 0.1 to 10 times the longer side; a principal point far
+            outside the photo; a photo that sees no point; or most cameras in one spot of a scene that is hundreds of
+            times as large.
     """
     if images is None:
         images = [model.images[i] for i in model.reg_image_ids()]
@@ -394,6 +400,13 @@ def check_model(model: Any, images: list[Any] | None = None) -> None:
         raise SceneError(f"the COLMAP model has no 3-D points: {advice}")
     for image in images:
         camera = model.cameras[image.camera_id]
+        centre = (camera.principal_point_x / max(camera.width, 1), camera.principal_point_y / max(camera.height, 1))
+        if min(camera.width, camera.height) < 1 or not all(-1 <= c <= 2 for c in centre):
+            raise SceneError(
+                f"camera {image.camera_id} of photo {image.name} has {camera.width} x {camera.height} pixels and its "
+                f"principal point at {centre[0]:.4g}, {centre[1]:.4g} of them (sane: within a side of the photo): "
+                f"{advice}"
+            )
         for f in (camera.focal_length_x, camera.focal_length_y):
             ratio = f / max(camera.width, camera.height)
             if not 0.1 < ratio < 10:

@@ -122,10 +122,11 @@ class Run(NamedTuple):
 def read_kind(path: Path) -> str:
     """The `kind` of a job file. "train" for a file that cannot be read: `load_job` says what is wrong with it."""
     try:
-        raw = yaml.safe_load(path.read_text())
+        raw = parse_yaml(path.read_text())
     except (OSError, yaml.YAMLError, ValueError):
         return "train"
-    return str(raw.get("kind", "train")) if isinstance(raw, dict) else "train"
+    kind = raw.get("kind") if isinstance(raw, dict) else None
+    return kind if isinstance(kind, str) else "train"
 
 
 def load_study(path: Path, settings: Sequence[str] = ()) -> StudyJob:

@@ -27,7 +27,6 @@ from pipeline.clock import Clock, Speed
 from pipeline.config import Job, TrainJob
 from pipeline.files import atomic_write
 from pipeline.heartbeat import Heartbeat, rank_path
-from pipeline.memory import keep_freed_memory
 from pipeline.patches import steps_per_epoch
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
@@ -172,9 +171,8 @@ def forward(work: Work, ddp: torch.nn.Module, step: int) -> tuple[dict[str, Tens
 
 
 def set_up_torch(job: Job, device: torch.device) -> None:
-    """Threads, memory, and how exact float32 is."""
+    """Threads, and how exact float32 is."""
     torch.set_num_threads(job.threads)
-    keep_freed_memory()
     torch.backends.cudnn.allow_tf32 = False  # float32 is float32; torch's default would round in convolutions
     if job.train.deterministic and device.type == "cuda":
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")

@@ -214,7 +214,7 @@ def in_blocks(network: Callable[..., tuple[Tensor, ...]], x: Tensor, *others: Te
     """network(x, *others), on a CPU a block of rays at a time.
 
     The numbers are the same. A layer of all points at once writes what no cache holds into memory that the system has
-    to hand out page by page, and takes half as long again (benchmarks/results/steps.json).
+    to hand out page by page; benchmarks/results/steps.json has the times of both.
 
     Args:
         network: gives tensors of as many rays as it gets.
@@ -224,8 +224,10 @@ def in_blocks(network: Callable[..., tuple[Tensor, ...]], x: Tensor, *others: Te
     count = max(1, BLOCK_POINTS * torch.get_num_threads() // x.shape[1])
     if x.device.type != "cpu" or len(x) <= count:
         return network(x, *others)
-    starts = range(0, len(x), count)
-    blocks = [network(*(None if a is None else a[i : i + count] for a in (x, *others))) for i in starts]
+    number = -(-len(x) // count)
+    # split, not slices: each of these would make a gradient as large as the whole.
+    pieces = [(None,) * number if a is None else a.split(count) for a in (x, *others)]
+    blocks = [network(*piece) for piece in zip(*pieces, strict=True)]
     return tuple(torch.cat(parts) for parts in zip(*blocks, strict=True))
 
 

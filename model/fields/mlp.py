@@ -46,9 +46,9 @@ class RadianceMLP(nn.Module):
         encoded = positional_encoding(xyz, self.xyz_frequencies)
         h = encoded
         for index, layer in enumerate(self.layers):
-            if index == self.skip and index > 0:
-                h = torch.cat([encoded, h], dim=-1)
-            h = torch.relu(layer(h))
+            assert isinstance(layer, nn.Linear)
+            h = joined(layer, encoded, h) if index == self.skip and index > 0 else layer(h)
+            h = h.relu_()  # in place: the layer does not look at its output again
         return h
 
     def forward(self, xyz: Tensor, direction: Tensor, code: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -73,8 +73,18 @@ class RadianceMLP(nn.Module):
         """Features (..., out_channels) from the bottleneck (..., width), as seen from `direction` in the appearance
         `code`.
         """
-        inputs = [bottleneck, positional_encoding(direction, self.dir_frequencies)]
+        seen = positional_encoding(direction, self.dir_frequencies)
         if code is not None:
-            inputs.append(code.to(bottleneck.dtype))
-        inputs = [x.expand(*bottleneck.shape[:-1], -1) for x in inputs]
-        return torch.sigmoid(self.head(torch.relu(self.directional(torch.cat(inputs, dim=-1)))))
+            seen, code = torch.broadcast_tensors(seen, code)
+            seen = torch.cat([seen, code], dim=-1)
+        return torch.sigmoid(self.head(joined(self.directional, bottleneck, seen).relu_()))
+
+
+def joined(layer: nn.Linear, a: Tensor, b: Tensor) -> Tensor:
+    """layer([a, b]) without a copy of both beside each other; what is the same for all samples of a ray, (R, 1, .),
+    goes through its part of the layer once.
+    """
+    weight_a, weight_b = layer.weight.split([a.shape[-1], b.shape[-1]], dim=1)
+    parts = functional.linear(a, weight_a, layer.bias), functional.linear(b, weight_b)
+    whole, other = parts if parts[0].numel() >= parts[1].numel() else parts[::-1]
+    return whole.add_(other)

@@ -18,6 +18,7 @@ from pipeline.photos import open_photos
 from pipeline.train import train
 from pipeline.work import Context
 
+RANKS_A_CORE = 16  # more than anyone wants
 GRACE = 120  # seconds that ranks have for their last checkpoint and picture
 
 
@@ -25,12 +26,15 @@ def run_local(job: Job) -> dict[str, Any]:
     """Train with the job's ranks on this machine; returns rank 0's result.
 
     Raises:
-        CrossrayError: a rank failed; its own message stands above.
+        CrossrayError: more ranks than this machine could run, or one failed; its own message stands above.
     """
+    device, most = pick_device(job, 0), RANKS_A_CORE * (os.cpu_count() or 1)
+    if device.type == "cpu" and job.ranks > most:
+        raise CrossrayError(f"ranks: {job.ranks} processes on this machine's {os.cpu_count()} cores; at most {most}")
     if job.ranks == 1:
         previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
-            return train(job, Context(device=pick_device(job, 0), should_stop=StopFlag().install()))
+            return train(job, Context(device=device, should_stop=StopFlag().install()))
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)

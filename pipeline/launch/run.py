@@ -10,10 +10,9 @@ from contextlib import nullcontext
 from importlib.util import find_spec
 from typing import Any
 
-import yaml
 from filelock import FileLock
 
-from pipeline.config import BOOKKEEPING, Job, flatten, save_job
+from pipeline.config import BOOKKEEPING, Job, flatten, read_saved, save_job
 from pipeline.cutting import cut_shards, mask_path, masks_hash, scene_record
 from pipeline.errors import CrossrayError
 from pipeline.evaluate import run_protocols
@@ -124,7 +123,7 @@ def claim_run(job: Job) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(job.run / ".job.lock"):
         if path.exists():
-            before = flatten(yaml.safe_load(path.read_text()))
+            before = read_saved(path)
             now = flatten(job.model_dump(mode="json"))
             differs = [
                 f"  {key}: {before.get(key)!r} -> {now.get(key)!r}"
@@ -200,6 +199,8 @@ def ensure_shards(job: Job) -> Manifest:
         CrossrayError: the scene or its masks are missing, or the shards that are there are of another size.
     """
     folder = job.shards
+    if job.scene.path.exists() and not job.scene.path.is_dir():
+        raise CrossrayError(f"scene.path: {job.scene.path} is a file; it names the folder of a posed scene")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(folder.parent / f".{folder.name}.lock"):
         manifest = read_manifest(folder) if (folder / MANIFEST).is_file() else None
@@ -215,18 +216,18 @@ def ensure_shards(job: Job) -> Manifest:
 
 def compared(job: Job, scene: Scene | None, manifest: Manifest | None) -> Manifest:
     """The job's shards, with a look at its scene if that is at hand: cut if there are none, or of other masks."""
+    fixed = job.model.transient == "fixed"
     if scene is not None:
         check_test_photos(job, Counter(photo.split for photo in scene.photos))
-    fixed = job.model.transient == "fixed"
-    if fixed and scene is not None:
-        check_masks(job, scene)
+        if fixed and (manifest is not None or job.scene.on_bad_photo == "refuse"):
+            check_masks(job, scene)
     if manifest is None:
         if scene is None and not job.scene.path.is_dir():
             raise CrossrayError(
                 f"scene.path: {job.scene.path} is not a folder, and there are no shards in {job.shards}; "
                 "--set scene.path=FOLDER names the posed scene"
             )
-        return cut(job)
+        return cut_and_check(job)
     check_dropped(job, manifest)
     if scene is None:
         log.info("%s is not at hand; training on the shards of %s", job.scene.path, manifest.scene.name)
@@ -235,7 +236,17 @@ def compared(job: Job, scene: Scene | None, manifest: Manifest | None) -> Manife
     check_sizes(job, manifest)
     if fixed and scene is not None and masks_hash(scene) != manifest.masks:
         log.info("the masks of %s have changed; its shards are cut again", job.scene.path)
-        return cut(job)
+        return cut_and_check(job)
+    return manifest
+
+
+def cut_and_check(job: Job) -> Manifest:
+    """Shards anew; which photos are left is known only now, where some may be left out."""
+    manifest = cut(job)
+    if manifest.dropped:
+        check_test_photos(job, manifest.splits)
+        if job.model.transient == "fixed":
+            check_masks(job, read_scene(job.scene.path, without=manifest.dropped))
     return manifest
 
 
@@ -262,6 +273,13 @@ def check_dropped(job: Job, manifest: Manifest) -> None:
             f"scene.on_bad_photo: refuse, but the shards in {job.shards} were cut without {len(manifest.dropped)} "
             f"photos ({next(iter(manifest.dropped.values()))}); mend them and remove that folder, or --set "
             "scene.on_bad_photo=drop"
+        )
+    if manifest.dropped:
+        log.warning(
+            "%d photos are not in the shards of %s (%s); once they are mended, remove that folder",
+            len(manifest.dropped),
+            job.shards,
+            next(iter(manifest.dropped.values())),
         )
 
 

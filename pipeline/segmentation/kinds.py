@@ -6,6 +6,7 @@ from collections.abc import Callable
 from difflib import get_close_matches
 from pathlib import Path
 
+from pipeline.files import resolved
 from pipeline.segmentation.base import Segmenter, SegmenterError
 from pipeline.segmentation.deeplabv3 import DeepLabV3
 from pipeline.segmentation.folder import MaskFolder
@@ -27,7 +28,7 @@ def find_segmenter(words: str) -> Segmenter:
     if name in NETWORKS and not path:
         return NETWORKS[name]()
     if name in WITH_PATH and path:
-        return WITH_PATH[name](Path(path).expanduser().resolve())
+        return WITH_PATH[name](resolved(Path(path).expanduser()))
     close = get_close_matches(name, [*NETWORKS, *WITH_PATH], n=1)
     hint = f"; did you mean {close[0]!r}?" if close and close[0] != name else ""
     raise SegmenterError(f"--with {words}: not one of {CHOICES}{hint}")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from model.losses import PRESETS, LossWeights
 from model.methods import AXES, METHODS
-from pipeline.config import RECIPES, Job, JobError, load_job, make_job, merge, parse_setting, save_job
+from pipeline.config import RECIPES, Job, JobError, load_job, make_job, merge, parse_setting, parse_yaml, save_job
 from pipeline.study import read_kind
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -555,3 +555,27 @@ class TestJobFiles:
         assert found.patch.photos * found.patch.size**2 == 1024
         assert (found.method, found.train.decay, found.scene.downscale) == ("crnerf", "cosine", 2)
         assert set(found.train.learning_rates.model_dump().values()) == {5e-4}
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("method: nerf\nname: a\nmethod: crnerf\n", "'method' is there twice"),
+        ("a: &a {b: 1}\nc:\n  <<: *a\n", "merge keys"),
+        ("[" * 5000, "RecursionError"),
+        ("a: !!bool x", "KeyError"),
+        ("a: !!timestamp x", "AttributeError"),
+    ],
+)
+def test_yaml_that_would_lose_or_grow_is_refused(text, words):
+    with pytest.raises((ValueError, yaml.YAMLError), match=words):
+        parse_yaml(text)
+
+
+def test_aliases_are_read():
+    assert parse_yaml("a: &a [1]\nb: *a\n") == {"a": [1], "b": [1]}
+
+
+def test_a_path_with_a_nul_is_refused():
+    with pytest.raises(JobError, match=r"runs: .* NUL"):
+        make_job({"name": "a", "scene": {"path": "."}, "runs": "a\0b"})

@@ -15,7 +15,16 @@ import numpy as np
 import pytest
 from tiny_scene import RADIUS, STEP, photo_names, tiny_points, write_tiny_scene
 
-from pipeline.scene import SceneError, check_model, is_collapsed, photo_key, read_scene
+from pipeline.scene import (
+    SceneError,
+    check_model,
+    find_model,
+    find_table,
+    fingerprint,
+    is_collapsed,
+    photo_key,
+    read_scene,
+)
 
 
 @pytest.fixture
@@ -367,3 +376,33 @@ def test_golden_colmap_scene(test_data, golden):
         np.testing.assert_allclose(right_up_back, expected["out/c2w"][i], rtol=0, atol=3e-6)
         assert photo.near == pytest.approx(expected["out/near"][i].item(), abs=3e-6)
         assert photo.far == pytest.approx(expected["out/far"][i].item(), abs=3e-6)
+
+
+def test_the_fingerprint_is_that_of_all_files_that_pose_the_photos(tmp_path):
+    write_tiny_scene(tmp_path / "scene", photos=3)
+    folder = find_model(tmp_path / "scene")[0]
+    before = fingerprint(tmp_path / "scene")
+    assert fingerprint(tmp_path / "scene") == before
+    (folder / "frames.bin").write_bytes(b"1")
+    other = fingerprint(tmp_path / "scene")
+    assert other != before
+    (folder / "frames.bin").write_bytes(b"2")
+    assert fingerprint(tmp_path / "scene") not in (before, other)
+
+
+def test_links_in_a_circle_are_no_photos(tmp_path):
+    write_tiny_scene(tmp_path / "scene", photos=3)
+    photo = read_scene(tmp_path / "scene").photos[0].path
+    photo.unlink()
+    photo.symlink_to(photo.name)
+    with pytest.raises(SceneError, match=photo.name):
+        read_scene(tmp_path / "scene")
+
+
+def test_a_quote_in_the_split_table_is_a_letter(tmp_path):
+    write_tiny_scene(tmp_path / "scene", photos=3)
+    table = find_table(tmp_path / "scene")
+    names = [photo.name for photo in read_scene(tmp_path / "scene").photos]
+    head, *rows = table.read_text().splitlines(keepends=True)
+    table.write_text("".join([head, '"not-there.jpg\t9\ttrain\ttiny\n', *rows]))
+    assert [photo.name for photo in read_scene(tmp_path / "scene").photos] == names

@@ -11,6 +11,7 @@ import logging
 import os
 import shutil
 import tarfile
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from pipeline.files import sha256_of
 from pipeline.launch.tasks import in_process
 from pipeline.manifest import Manifest, ShardError, digest, read_manifest
 from pipeline.patches import PatchPlan
-from pipeline.pictures import decode_photo
+from pipeline.pictures import conversion, decode_photo
 from pipeline.scene import SceneError, read_scene
 from pipeline.shards import read_shard, verify_shards
 
@@ -536,3 +537,43 @@ def test_real_shards_run_again_are_only_verified(reichstag_shards, test_data):
     before = contents(reichstag_shards)
     cut(test_data / "reichstag", reichstag_shards, downscale=8, plan=PatchPlan())
     assert contents(reichstag_shards) == before
+
+
+def test_two_photos_of_one_mask_are_refused(tmp_path):
+    root = write_tiny_scene(tmp_path / "scene", photos=3)
+    (first, *_) = read_scene(root).photos
+    (root / "masks").mkdir(exist_ok=True)
+    Image.new("L", (first.width, first.height)).save(mask_name := (root / "masks" / first.name).with_suffix(".png"))
+    twin = first.path.with_suffix(".gif")
+    Image.new("RGB", (first.width, first.height)).save(twin)
+    images = next((root / "dense").rglob("images.txt"))
+    second = read_scene(root).photos[1].name
+    images.write_text(images.read_text().replace(second, twin.name))
+    table = root / "tiny.tsv"
+    table.write_text(table.read_text().replace(second, twin.name))
+    with pytest.raises(ShardError, match=f"{mask_name.name} would be the mask of"):
+        cut_shards(root, tmp_path / "shards", downscale=1, plan=PatchPlan(), mapper=in_process)
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path):
+    root = write_tiny_scene(tmp_path / "scene", photos=3)
+    (first, *_) = read_scene(root).photos
+    (root / "masks").mkdir(exist_ok=True)
+    Image.new("L", (10, 1000)).save((root / "masks" / first.name).with_suffix(".png"))
+    with pytest.raises(ShardError, match="10 x 1000 pixels, which is not the shape"):
+        cut_shards(root, tmp_path / "shards", downscale=1, plan=PatchPlan(), mapper=in_process)
+
+
+@pytest.mark.parametrize("mode", ["I;16", "RGB"])
+def test_sixteen_bits_are_told(mode):
+    png = io.BytesIO()
+    if mode == "I;16":
+        Image.new(mode, (4, 4)).save(png, "PNG")
+        assert conversion(png.getvalue()) == "16-bit grayscale"
+        return
+    Image.new(mode, (4, 4)).save(png, "PNG")
+    assert conversion(png.getvalue()) is None
+    deep = bytearray(png.getvalue())
+    deep[24] = 16
+    deep[29:33] = zlib.crc32(bytes(deep[12:29])).to_bytes(4, "big")
+    assert conversion(bytes(deep)) == "16-bit RGB"
