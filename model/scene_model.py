@@ -25,7 +25,6 @@ from model.appearance.crossray import AffineDecoder, ContentStatistics, Released
 from model.appearance.encoder import ReleasedEncoder
 from model.cameras import patch_grid
 from model.fields.base import (
-    RENDER_POINTS,
     Codes,
     Field,
     Level,
@@ -34,6 +33,7 @@ from model.fields.base import (
     Rays,
     Rendering,
     at_least_float32,
+    render_points,
 )
 from model.fields.hash import HashField
 from model.fields.nerf import NeRFField
@@ -414,7 +414,7 @@ class SceneModel(nn.Module):
         v, u = ((torch.arange(n, device=image.device) + 0.5) / n for n in size)
         uv = torch.stack(torch.meshgrid(v, u, indexing="ij"), dim=-1)
         number = torch.tensor([photo], device=image.device)
-        parts = uv.view(1, -1, 2).split(RENDER_POINTS, dim=1)
+        parts = uv.view(1, -1, 2).split(render_points(image.device), dim=1)
         return torch.cat([self.uvmask(number, part) for part in parts], dim=1).view(size)
 
     # ----------------------------------------------------------------------------------------------- rendering
@@ -424,8 +424,8 @@ class SceneModel(nn.Module):
         self, rays: Rays, chunk: int | None = None, samples: tuple[int, int] | None = None, code: Tensor | None = None
     ) -> Rendering:
         """Features (R, C; C + 1 fused at points), depth and accumulation of R rays, `chunk` at a time, without a number
-        as many as RENDER_POINTS allows. Memory holds one chunk beside the result, whatever the view's size: an
-        activation of the paper's MLP is RENDER_POINTS x 256 floats (0.27 GB), and a few of them live at once.
+        as many as `render_points` allows. Memory holds one chunk beside the result, whatever the view's size: an
+        activation of the paper's MLP is 256 floats a point (67 MB, on a GPU 0.27 GB), and a few of them live at once.
 
         Args:
             code: (1, CODE) appearance, for a field that reads one.

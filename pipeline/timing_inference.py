@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from model.appearance.crossray import ContentStatistics
-from model.fields.base import RENDER_POINTS, Codes, Placed, Rays, at_least_float32
+from model.fields.base import Codes, Placed, Rays, at_least_float32, render_points
 from model.scene_model import SceneModel
 from pipeline.config import Job
 from pipeline.provenance import device_name
@@ -316,7 +316,8 @@ def time_rays(meter: Meter, rays: Rays, chunk: int, work: Callable[[Rays], objec
 
 def chunk_of(setting: Setting) -> int:
     """Rays that `SceneModel.render` takes at once."""
-    return max(1, RENDER_POINTS // setting.model.field.points_a_ray(setting.samples))
+    device = next(setting.model.parameters()).device
+    return max(1, render_points(device) // setting.model.field.points_a_ray(setting.samples))
 
 
 def flops_a_ray(work: Callable[[Rays], object], rays: Rays) -> float:

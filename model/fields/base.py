@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from model.transient.uncertainty import Transient
 from model.volume import composite, joint_weights
 
-RENDER_POINTS = 2**18  # points that go through a field at once when no gradient is needed
 BLOCK_POINTS = 2**11  # points a CPU thread that go through a network at once: a layer's output stays in the cache
 
 
@@ -129,8 +128,8 @@ class Field(nn.Module):
         raise NotImplementedError
 
     def chunks(self, rays: Rays, chunk: int | None, samples: tuple[int, int] | None) -> Iterator[Rays]:
-        """The rays, `chunk` at a time, or as many as RENDER_POINTS allows."""
-        chunk = chunk or max(1, RENDER_POINTS // self.points_a_ray(samples))
+        """The rays, `chunk` at a time, or as many as `render_points` allows."""
+        chunk = chunk or max(1, render_points(rays.near.device) // self.points_a_ray(samples))
         for start in range(0, len(rays.near), chunk):
             yield Rays(*(r[start : start + chunk] for r in rays))
 
@@ -199,6 +198,13 @@ class Field(nn.Module):
         assert self.transient is not None
         seen = Transient(*in_blocks(self.transient, placed.inner, code[:, None]))
         return transient_samples(seen, placed.density, placed.deltas)
+
+
+def render_points(device: torch.device) -> int:
+    """Points that go through a field at once when no gradient is needed: what keeps a GPU busy, and on a CPU what its
+    allocator does not ask the system for each time.
+    """
+    return 2**16 if device.type == "cpu" else 2**18
 
 
 def linear(weight: Tensor, bias: Tensor) -> nn.Linear:

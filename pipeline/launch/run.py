@@ -243,7 +243,7 @@ def compared(job: Job, scene: Scene | None, manifest: Manifest | None) -> Manife
 def cut_and_check(job: Job) -> Manifest:
     """Shards anew; which photos are left is known only now, where some may be left out."""
     manifest = cut(job)
-    if manifest.dropped:
+    if job.scene.on_bad_photo == "drop":
         check_test_photos(job, manifest.splits)
         if job.model.transient == "fixed":
             check_masks(job, read_scene(job.scene.path, without=manifest.dropped))

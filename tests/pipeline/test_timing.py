@@ -15,7 +15,7 @@ import pytest
 import torch
 import yaml
 
-from model.fields.base import RENDER_POINTS, Codes, Rays
+from model.fields.base import Codes, Rays, render_points
 from model.methods import METHODS
 from pipeline import cli
 from pipeline.config import JobError
@@ -245,7 +245,7 @@ def test_what_is_rendered_in_two_parts_is_what_is_rendered_at_once():
 def test_chunks_are_those_of_rendering():
     timing = tiny()
     for setting in settings(timing, "crnerf", CPU):
-        assert chunk_of(setting) == RENDER_POINTS // sum(setting.samples)
+        assert chunk_of(setting) == render_points(torch.device("cpu")) // sum(setting.samples)
     assert [s.samples for s in settings(timing, "crnerf", CPU)] == [(64, 64), (256, 256)]
     assert [s.samples for s in settings(timing, "crossray", CPU)] == [(32, 16)]  # it has its own, and only those
 

@@ -499,6 +499,12 @@ def test_a_model_that_is_the_one_of_the_shards_is_not_read_again(make, cut, tmp_
         ensure_shards(job)
 
 
+def test_a_scene_that_is_a_file_is_refused(make, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(CrossrayError, match=r"scene\.path: .* is a file"):
+        ensure_shards(make("nerf", over={"scene": {"path": str(tmp_path / "file")}}))
+
+
 def test_shards_train_without_their_scene(make, tmp_path):
     manifest = ensure_shards(make("nerf", over={"scene": {"path": str(tmp_path / "not here")}}))
     assert len(manifest.keys) == 6
@@ -544,6 +550,32 @@ def test_changed_masks_are_cut_into_the_shards_again(masked):
     assert len(cuts) == 2
     assert after.content_hash != before.content_hash
     np.testing.assert_array_equal(open_photos(job.shards).mask(0) > 127, (255 - mask)[::2, ::2] > 127)
+
+
+def test_a_dropped_photo_needs_no_mask(masked):
+    job, cuts = masked
+    photo = next((job.scene.path / "dense").rglob("photo_000.*"))
+    photo.write_bytes(b"")
+    (job.scene.path / "masks" / "photo_000.png").unlink()
+    with pytest.raises(CrossrayError, match="holds no mask of photo_000"):
+        ensure_shards(job)
+    dropping = job.model_copy(update={"scene": job.scene.model_copy(update={"on_bad_photo": "drop"})})
+    assert len(ensure_shards(dropping).keys) == 5
+    assert ensure_shards(dropping).dropped.keys() == {photo.name}
+    assert len(cuts) == 1
+
+
+def test_with_all_test_photos_dropped_nothing_is_trained(make, cut, tmp_path, monkeypatch):
+    monkeypatch.setattr(launch, "ray_tasks", lambda: nullcontext(in_process))
+    shutil.copytree(cut / "scene", tmp_path / "scene")
+    for photo in read_scene(tmp_path / "scene").photos:
+        if photo.split == "test":
+            photo.path.write_bytes(b"")
+    scene = {"path": str(tmp_path / "scene"), "shards": str(tmp_path / "left"), "on_bad_photo": "drop"}
+    job = make("nerf", over={"scene": scene, "evaluate": {"protocols": ["crnerf-full@R2"]}})
+    for _ in range(2):
+        with pytest.raises(CrossrayError, match="no test photo"):
+            ensure_shards(job)
 
 
 def test_masks_of_two_origins_are_refused(masked):
