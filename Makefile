@@ -1,4 +1,4 @@
-# make quickstart   the whole pipeline on the built-in landmark (about 5 minutes on 2 cores)
+# make quickstart   the whole pipeline on the built-in landmark (under 4 minutes on 2 cores)
 # make test         everything that a machine without a cluster can show: 8 minutes on 2 cores
 # make check        the fast part, for every commit
 # make test-cluster clusters of several nodes on this machine, and nodes that are lost: under 30 minutes
