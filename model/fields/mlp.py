@@ -75,8 +75,8 @@ class RadianceMLP(nn.Module):
         """
         seen = positional_encoding(direction, self.dir_frequencies)
         if code is not None:
-            seen, code = torch.broadcast_tensors(seen, code)
-            seen = torch.cat([seen, code], dim=-1)
+            places = torch.broadcast_shapes(seen.shape[:-1], code.shape[:-1])
+            seen = torch.cat([x.expand(*places, -1) for x in (seen, code)], dim=-1)
         return torch.sigmoid(self.head(joined(self.directional, bottleneck, seen).relu_()))
 
 
