@@ -303,10 +303,10 @@ class TestRows:
     def test_a_single_image_has_its_operations(self, images):
         row = cell(images, "hanerf", 1)
         layers = 93 * 256 + 3 * 256 * 256 + (256 + 93) * 256 + 3 * 256 * 256 + 256 * 257
-        coarse = layers + (256 + 27) * 128 + 128 * 3
-        fine = layers + (256 + 27 + 48) * 128 + 128 * 3
+        point = layers + 256 * 128 + 128 * 3
+        seen = 27 * 128 + (27 + 48) * 128  # direction and code, once a ray for each network
         composited = 128 * 3
-        assert row.flops == 2 * 16 * (64 * coarse + 128 * fine + composited)
+        assert row.flops == 2 * 16 * ((64 + 128) * point + seen + composited)
         assert row.how == "rendered"
         assert row.peak_flops == 1e9
 
