@@ -474,7 +474,7 @@ class SceneModel(nn.Module):
             with self.autocast(rays.near.device):
                 march = self.field.march(part, samples=samples, codes=codes)
             yield march  # outside: a generator's context would stay open while its caller composites
-            del march
+            del march  # else it would live while the next one is made
 
     def picture(self, placed: Placed, code: Tensor, transient: Tensor | None) -> Tensor:
         """rgb (R, 3) at placed samples, with gradient to the codes (1, .): what a code is fitted with."""

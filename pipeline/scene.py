@@ -332,8 +332,7 @@ def model_folders(root: Path) -> list[Path]:
 
 def fingerprint(root: Path) -> str:
     """SHA-256 of the files that say where the photos were taken from and which are for training: models and split
-    table. The same one, the same scene; it takes no reading of the model, which for 5,000 photos is a minute
-    (benchmarks/results/start.json).
+    table. The same one, the same scene, without reading the model, which takes long where photos are many.
     """
     root = resolved(root)
     table = find_table(root)

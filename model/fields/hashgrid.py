@@ -89,9 +89,8 @@ class _GatherCorners(torch.autograd.Function):
     """Per level l and point n the sum over corners of weight * table[index], as (N, L F); the backward pass is a
     scatter-add into the table alone.
 
-    Corner by corner and feature by feature, which on a CPU takes three quarters of embedding_bag's time, for it wants
-    the corners of a point beside each other (benchmarks/results/fast-step.json). autograd's own route (indexing)
-    materialises (8, L N, F) twice.
+    Corner by corner and feature by feature: embedding_bag wants the corners of a point beside each other, and to turn
+    them round costs a CPU more than it saves. autograd's own route (indexing) materialises (8, L N, F) twice.
     """
 
     @staticmethod
