@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import re
 from pathlib import Path
 
 import pytest
 
-from pipeline.files import atomic_file, atomic_write, sha256_of
+from pipeline.files import atomic_file, atomic_write, resolved, sha256_of
 
 
 def names(folder: Path) -> list[str]:
@@ -89,3 +91,18 @@ def test_content_is_whole_text_is_utf8_and_folders_are_made(tmp_path):
     assert sha256_of(path) == hashlib.sha256(content).hexdigest()
     atomic_write(path, "größer\n")
     assert path.read_bytes() == b"gr\xc3\xb6\xc3\x9fer\n"
+
+
+def test_an_error_of_the_disk_tells_the_file_and_not_its_temporary_one(tmp_path):
+    path = tmp_path / "record.json"
+    with pytest.raises(OSError, match=re.escape(f"No space left on device: {str(path)!r}")), atomic_file(path):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(OSError, match="elsewhere"), atomic_file(path):
+        raise OSError(errno.EACCES, "no", "elsewhere")
+    assert not list(tmp_path.iterdir())
+
+
+def test_links_in_a_circle_stay_as_they_are(tmp_path):
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    assert resolved(tmp_path / "a").parent == resolved(tmp_path)

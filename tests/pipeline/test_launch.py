@@ -175,3 +175,9 @@ def test_sigterm_to_one_rank_stops_it_and_gives_the_signal_back(cut, monkeypatch
     assert signal.getsignal(signal.SIGTERM) is before
     assert (result["steps"], result["finished"]) == (4, False)
     assert [p.name for p in committed(checkpoints(job))] == ["step-00000004"]
+
+
+def test_more_ranks_than_a_machine_could_run_are_refused_at_once(cut):
+    job = tiny_job(cut).model_copy(update={"ranks": 100_000})
+    with pytest.raises(CrossrayError, match="ranks: 100000 processes on this machine's"):
+        run_local(job)
