@@ -4,14 +4,11 @@
                        preview.png         a few views, side by side
                        baked.json          what it is, and hashes; written last
 
-A baked appearance has one set of content statistics for all views. A model of the policy `running` has it. For `view`
-and `patch` it is the average over at most VIEWS training views, evenly chosen, of the statistics of a 32 x 32 grid of
-each view's rays: what such a model uses in a typical view.
+A baked appearance has one set of content statistics for all views (`pipeline.appearances.fixed_statistics`).
 """
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from collections.abc import Sequence
@@ -26,43 +23,23 @@ from pydantic import TypeAdapter, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load as load_safetensors
 from safetensors.torch import save as save_safetensors
-from torch import Tensor
 
-from model.appearance.crossray import ContentStatistics
 from model.bake import Baked, bake, blank, check_bakeable
 from model.methods import ModelSpec
-from model.scene_model import SceneModel
+from pipeline.appearances import find_appearance, fixed_statistics
 from pipeline.board import PICTURE_SIDE
 from pipeline.checkpoint import MODEL, digest
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write, sha256_of
-from pipeline.manifest import ShardError
 from pipeline.metrics import to_8bit
 from pipeline.photos import Photos
-from pipeline.pictures import FORMATS, reason, to_rgb
 from pipeline.provenance import provenance
-from pipeline.render import (
-    check_reference,
-    grid_statistics,
-    interpolated,
-    read_appearance,
-    render_baked,
-    statistics_of,
-)
+from pipeline.render import interpolated, render_baked
 from pipeline.runs import load_run, photos_of
-from pipeline.truth import reduced
 
 FORMAT = 1
 WEIGHTS, RECORD, PREVIEW = "baked.safetensors", "baked.json", "preview.png"
-VIEWS = 32  # training views over which statistics are averaged, at most
 PREVIEWED = 4  # views of the preview, at most
-
-
-class Read(NamedTuple):
-    """An appearance, and where it comes from."""
-
-    F: Tensor  # F^a (1, C, g, g)
-    source: dict[str, str]  # photo, sha256 of its file
 
 
 class BakedAppearance(NamedTuple):
@@ -100,9 +77,9 @@ def bake_run(
         raise CrossrayError(f"{run}: method {job.method}: {error}") from None
     photos = photos_of(job, checkpoint)
     chosen = [find_appearance(model, photos, name) for name in (appearance, towards) if name is not None]
-    F = None
-    if model.encoder is not None:
-        F = interpolated(chosen[0].F, chosen[1].F, share) if len(chosen) > 1 else chosen[0].F
+    F, other = chosen[0].F, chosen[-1].F
+    if towards is not None and F is not None and other is not None:
+        F = interpolated(F, other, share)
     about = {"appearances": [c.source for c in chosen], "share": share if len(chosen) > 1 else None}
     folder = out or run / "baked" / folder_name([appearance, *([] if towards is None else [towards])], share)
     claim(folder, about)
@@ -145,59 +122,6 @@ def claim(folder: Path, about: dict[str, Any]) -> None:
         return  # not completed, or damaged: it is written anew
     if not same:
         raise CrossrayError(f"{folder} holds another baked appearance; --out names another folder")
-
-
-# --------------------------------------------------------------------------------------------------- appearances
-
-
-def find_appearance(model: SceneModel, photos: Photos, name: str) -> Read:
-    """The appearance of a photo of the scene by its name, or else of an image file.
-
-    Raises:
-        CrossrayError: there is neither, it is no image that we read, or it is too small.
-    """
-    records = {record.name: index for index, record in enumerate(photos.records)}
-    if name in records:
-        index = records[name]
-        picture, sha256 = photos.reference(index), photos.records[index].source_sha256
-    elif Path(name).is_file():
-        picture, sha256 = read_picture(Path(name)), sha256_of(Path(name))
-        picture = reduced(picture, photos.manifest.reference_downscale)
-    else:
-        close = difflib.get_close_matches(name, records, n=1, cutoff=0.5)
-        guess = f"; did you mean {close[0]!r}?" if close else f" (the first is {photos.records[0].name!r})"
-        raise CrossrayError(f"{name}: neither an image file nor the name of a photo of the scene{guess}")
-    check_reference(model.spec, picture, name)
-    F = read_appearance(model, picture)
-    return Read(torch.empty(0) if F is None else F, {"photo": Path(name).name, "sha256": sha256})
-
-
-def read_picture(path: Path) -> np.ndarray:
-    """An image file as uint8 RGB (h, w, 3), as the shards read photos: EXIF orientation is ignored, alpha dropped.
-
-    Raises:
-        CrossrayError: it cannot be read.
-    """
-    try:
-        with Image.open(path, formats=FORMATS) as image:
-            return to_rgb(image, str(path))
-    except ShardError:
-        raise
-    except Exception as error:  # Pillow's decoders raise whatever they meet
-        raise CrossrayError(f"{path}: cannot be read as an image ({reason(error)})") from error
-
-
-def fixed_statistics(model: SceneModel, photos: Photos) -> tuple[ContentStatistics | None, str]:
-    """Content statistics for all views, and in words how they were taken; None for a model without a transform."""
-    if model.transform is None:
-        return None, "none: the model has no transform"
-    policy, train = model.spec.statistics, photos.indices("train")
-    if policy == "running":
-        return statistics_of(model, None), "running averages of the training"
-    chosen = train[:: -(-len(train) // VIEWS)]
-    found = [grid_statistics(model, photos.records[index]) for index in chosen]
-    mean, gram = (torch.stack(parts).mean(0) for parts in zip(*found, strict=True))
-    return ContentStatistics(mean, gram), f"{policy}: average over {len(chosen)} training views"
 
 
 # --------------------------------------------------------------------------------------------------------- files

@@ -7,7 +7,7 @@ appearance.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -21,12 +21,35 @@ from model.methods import ModelSpec, StatisticsPolicy, smallest_side
 from model.scene_model import ColourMap, SceneModel
 from pipeline.batches import as_tensor
 from pipeline.errors import CrossrayError
-from pipeline.manifest import CameraRecord
+from pipeline.manifest import Row
 from pipeline.photos import Photos
 
 STATISTICS_SIDE = 32  # rays a side of the grid whose points give the statistics of appearance that is fused at points
 # Colour values that are computed at once when a view is re-coloured: 1 MiB, as a core caches; on a GPU, few launches.
 RECOLOURED = {"cpu": 2**18, "cuda": 2**25}
+
+
+class Pinhole(Protocol):
+    """A camera as rendering reads it: a photo's `CameraRecord`, or a `pipeline.views.camera.Camera`."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def fx(self) -> float: ...
+    @property
+    def fy(self) -> float: ...
+    @property
+    def cx(self) -> float: ...
+    @property
+    def cy(self) -> float: ...
+    @property
+    def c2w(self) -> tuple[Row, Row, Row]: ...
+    @property
+    def near(self) -> float: ...
+    @property
+    def far(self) -> float: ...
 
 
 class View(NamedTuple):
@@ -39,7 +62,7 @@ class View(NamedTuple):
     points: Tensor | None = None  # (M, C): where appearance is fused at points, features at some of the view's points
 
 
-def view_rays(camera: CameraRecord, pixel_center: float, device: torch.device, stride: int = 1) -> Rays:
+def view_rays(camera: Pinhole, pixel_center: float, device: torch.device, stride: int = 1) -> Rays:
     """A ray through every `stride`-th pixel of every `stride`-th row, in row order."""
     rows, cols = torch.meshgrid(
         torch.arange(stride // 2, camera.height, stride, device=device),
@@ -62,7 +85,7 @@ def grid_rays(rays: Rays, size: tuple[int, int]) -> Rays:
 
 def render_view(
     model: SceneModel,
-    camera: CameraRecord,
+    camera: Pinhole,
     code: Tensor | None = None,
     *,
     stride: int = 1,
@@ -150,7 +173,7 @@ def statistics_of(
 
 
 @torch.no_grad()
-def grid_statistics(model: SceneModel, camera: CameraRecord) -> ContentStatistics:
+def grid_statistics(model: SceneModel, camera: Pinhole) -> ContentStatistics:
     """Content statistics over a grid of STATISTICS_SIDE^2 rays that spans a view, or over the points on them where
     appearance is fused there; nothing else of the view is rendered. ValueError for a model without a transform.
     """
@@ -220,7 +243,7 @@ def colour_view(
 
 
 def render_picture(
-    model: SceneModel, camera: CameraRecord, appearance: Tensor | None, samples: tuple[int, int] | None = None
+    model: SceneModel, camera: Pinhole, appearance: Tensor | None, samples: tuple[int, int] | None = None
 ) -> tuple[View, np.ndarray]:
     """A view in one appearance, whatever way the model uses it."""
     view = render_view(model, camera, appearance if model.coded else None, samples=samples)
@@ -228,7 +251,7 @@ def render_picture(
 
 
 def render_baked(
-    baked: Baked, camera: CameraRecord, *, stride: int = 1, samples: tuple[int, int] | None = None
+    baked: Baked, camera: Pinhole, *, stride: int = 1, samples: tuple[int, int] | None = None
 ) -> tuple[View, np.ndarray]:
     """A view of a baked model, whose features are its colours, and the same as float32 (h, w, 3) in (0, 1)."""
     rays = view_rays(camera, baked.spec.pixel_center, baked.b.device, stride)

@@ -17,15 +17,13 @@ from tiny_run import cut_tiny, tiny_job
 from model.methods import MLPSpec, ModelSpec
 from model.scene_model import SceneModel
 from pipeline import cli
+from pipeline.appearances import find_appearance, fixed_statistics, read_picture
 from pipeline.bake import (
     PREVIEW,
     RECORD,
     WEIGHTS,
     bake_run,
-    find_appearance,
-    fixed_statistics,
     load_baked,
-    read_picture,
 )
 from pipeline.checkpoint import MODEL
 from pipeline.errors import CrossrayError
@@ -223,7 +221,7 @@ def test_exif_orientation_is_ignored(tmp_path):
 
 def test_a_file_is_reduced_as_references_are(run, tmp_path, photos, monkeypatch):
     seen = []
-    monkeypatch.setattr("pipeline.bake.read_appearance", lambda model, picture: seen.append(picture.shape))
+    monkeypatch.setattr("pipeline.appearances.read_appearance", lambda model, picture: seen.append(picture.shape))
     model = load_run(run())[1]
     path = picture_file(tmp_path / "outside.png", (43, 31))
     find_appearance(model, photos, str(path))
