@@ -388,6 +388,72 @@ def bake(
 
 
 @app.command()
+def render(
+    run: Annotated[Path, typer.Argument(help="Folder of a trained run.")],
+    out: Annotated[Path, typer.Option(help="Folder for PNGs, film.mp4, or path.json for the camera path alone.")],
+    view: Annotated[
+        str,
+        typer.Option(metavar="VIEW", help="train, val, test, a photo's name, orbit, interpolate:A..B, or path.json."),
+    ] = "orbit",
+    appearance: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PHOTO",
+            help="A photo of the scene or any image file, A..B from one to another; stills have their own by default.",
+        ),
+    ] = None,
+    what: Annotated[str, typer.Option(help="Of rgb, depth, mask, accumulation; separated by commas.")] = "rgb",
+    size: Annotated[str | None, typer.Option(help="Pixels: 640 for the longer side, or 640x480.")] = None,
+    frames: Annotated[int, typer.Option(help="Of orbit and interpolate.")] = 240,
+    fps: Annotated[float | None, typer.Option(help="Frames per second; 30, or what the path's file says.")] = None,
+    path_format: Annotated[str, typer.Option(help="Of --out path.json: nerfstudio or nerfbaselines.")] = "nerfstudio",
+    step: Annotated[int | None, typer.Option(help="Checkpoint to render; the newest by default.")] = None,
+    use_ray: Annotated[bool, typer.Option("--ray", help="Spread the pictures over Ray tasks.")] = False,
+) -> None:
+    """Render views or a film, in an appearance of your choice. Again: goes on where it was."""
+    from contextlib import nullcontext
+
+    from pipeline.film import Order, render_film
+    from pipeline.launch.tasks import in_process, one_gpu_if_any, ray_tasks
+    from pipeline.progress import shown
+
+    order = Order(view, appearance, tuple(what.split(",")), size, frames, fps, path_format)
+    with ray_tasks(needs=one_gpu_if_any) if use_ray else nullcontext(in_process) as mapper:
+        for path in render_film(run, out, order, shown(mapper, "rendering"), step):
+            print_line(str(path))
+
+
+@app.command()
+def export(
+    run: Annotated[Path, typer.Argument(help="Folder of a trained run.")],
+    out: Annotated[Path, typer.Option(help="Folder for the files.")],
+    what: Annotated[str, typer.Option(help="Of points, depth, cameras and views, with commas.")] = (
+        "points,depth,cameras,views"
+    ),
+    appearance: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PHOTO", help="A photo of the scene, by name, or an image file; else the first training photo."
+        ),
+    ] = None,
+    view: Annotated[
+        str, typer.Option(help="Views, depth maps and cameras of: train, val, test, all, or a photo, by name.")
+    ] = "test",
+    points: Annotated[
+        int, typer.Option(help="Rays for the point cloud at most; those that meet one sure surface give a point.")
+    ] = 1_000_000,
+    step: Annotated[int | None, typer.Option(help="Checkpoint to export; the newest by default.")] = None,
+) -> None:
+    """A point cloud, depth maps, cameras and views in one appearance, for other programs. Again: goes on."""
+    from pipeline.exporting.export import export_run
+
+    words = [word.strip() for word in what.split(",") if word.strip()]
+    record = export_run(run, out, words, appearance, view, points, step)
+    counts = ", ".join(f"{count} {name}" for name, count in record["counts"].items())
+    print_line(f"{out}: {counts}; {out / 'README.txt'} says what is what")
+
+
+@app.command()
 def status(
     runs: Annotated[list[Path], typer.Argument(help="Runs, or folders of runs.")] = [Path("runs")],  # noqa: B006
 ) -> None:

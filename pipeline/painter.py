@@ -9,8 +9,10 @@ where the field itself reads the appearance (NeRF-W, Ha-NeRF).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +23,17 @@ from pipeline.appearances import Read, find_appearance, fixed_statistics
 from pipeline.metrics import to_8bit
 from pipeline.render import Pinhole, View, colour_view, interpolated, recoloured, render_view
 from pipeline.runs import load_run, photos_of
+from pipeline.views.camera import Camera
+
+STRIPE = 2**18  # pixels of a picture whose features are held at once: 64 MiB of 64 channels
+
+
+class Picture(NamedTuple):
+    """A painted view."""
+
+    rgb: np.ndarray  # uint8 (h, w, 3)
+    depth: np.ndarray  # float32 (h, w): mean distance of what is seen, sum w t / sum w, scene units along the ray
+    accumulation: np.ndarray  # float32 (h, w) in [0, 1]
 
 
 class Painter:
@@ -74,3 +87,24 @@ class Painter:
             return recoloured(view, self.model.colour_map(None, None)) * len(appearances)
         F = torch.cat([f for f in appearances if f is not None])
         return recoloured(view, self.model.colour_map(self.content, F))
+
+    def picture(self, camera: Camera, F: Tensor | None) -> Picture:
+        """A view in one appearance. Memory: the picture, and the features of STRIPE pixels; since the view decides no
+        statistics, in stripes it is the same picture.
+        """
+        stripes = []
+        for camera_part in stripes_of(camera):
+            view = self.view(camera_part, F)
+            (rgb,) = self.paint(view, [F])
+            depth = view.depth / view.accumulation.clamp(min=1e-3)
+            stripes.append(Picture(rgb, depth.cpu().numpy(), view.accumulation.cpu().numpy()))
+        return Picture(*(np.concatenate(parts) for parts in zip(*stripes, strict=True)))
+
+
+def stripes_of(camera: Camera) -> list[Camera]:
+    """The camera's picture as stripes of whole rows, from the top, of at most STRIPE pixels (but one row at least)."""
+    rows = max(1, STRIPE // camera.width)
+    return [
+        replace(camera, height=min(rows, camera.height - top), cy=camera.cy - top)
+        for top in range(0, camera.height, rows)
+    ]

@@ -52,6 +52,13 @@ def one_cpu(spec: Any) -> dict[str, float]:
     return {"num_cpus": 1}
 
 
+def one_gpu_if_any(spec: Any) -> dict[str, float]:
+    """What a task takes that renders: a GPU where the connected cluster has one, else a CPU."""
+    import ray
+
+    return {"num_cpus": 1, "num_gpus": 1} if ray.cluster_resources().get("GPU", 0) >= 1 else {"num_cpus": 1}
+
+
 @contextmanager
 def ray_tasks(
     num_cpus: int | None = None,

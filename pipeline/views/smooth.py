@@ -1,0 +1,227 @@
+"""Smooth camera paths that stay where a scene was seen: a loop through the training cameras, and flights from photo to
+photo.
+
+The loop's every centre and every point that it looks at is a convex combination of those of the training cameras, with
+most of the weight on cameras nearby: so it lies within their hull, and looks as the cameras around it look.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from pipeline.errors import CrossrayError
+from pipeline.views.camera import Camera, posed, resized
+from pipeline.views.geometry import focus_of, looking, median_of, unit, up_of, weighted_median
+from pipeline.views.path import MAX_FRAMES
+
+NEAREST = 8  # cameras whose depth bounds a view takes over
+GAP = math.radians(60)  # between neighbours around the focus: a wider one is no part of the loop
+BAND = math.radians(12)  # of angles over which cameras are averaged, at most
+TAILS = (5, 95)  # percentiles of the cameras' angles between which an open loop stays
+ASPECT = 3 / 2
+DENSE = 512  # points in which a loop is laid out
+SMOOTHING = 0.02  # of a loop's length: sigma of the filter that rounds its corners
+
+
+def bounds_at(cameras: Sequence[Camera], centres: np.ndarray) -> tuple[float, float]:
+    """Depth bounds for a film from `centres` (F, 3): least near and greatest far of the NEAREST cameras of each.
+
+    One pair for all frames, as samples lie evenly between the bounds: they would shimmer if these moved.
+    """
+    known = cKDTree([camera.pose[:, 3] for camera in cameras])
+    _, nearest = known.query(centres, k=range(1, min(NEAREST, len(cameras)) + 1))
+    used = [cameras[i] for i in np.unique(nearest)]
+    return min(camera.near for camera in used), max(camera.far for camera in used)
+
+
+def orbit(cameras: Sequence[Camera], frames: int, size: tuple[int, int] | None = None) -> list[Camera]:
+    """A closed loop through training cameras: around what they look at where they surround it, else along them and
+    back; it starts and ends without a jump.
+
+    The field of view across the shorter side is the median of the cameras': a wide picture then shows no more above and
+    below than photos do. Depth bounds are `bounds_at`. Memory: a few DENSE x len(cameras) float64.
+
+    Args:
+        size: width and height of the pictures; by default 3:2, as high as the photos' shorter sides in the median.
+
+    Raises:
+        CrossrayError: no camera, a number of frames outside 1 to MAX_FRAMES, or a size without pixels.
+    """
+    check_count(frames)
+    if not cameras:
+        raise CrossrayError("an orbit goes along training cameras, and there is none")
+    poses = np.array([camera.pose for camera in cameras])
+    up = up_of(poses)
+    typical = median_distance(cameras)
+    targets, angles = looked_at(poses, up, typical)
+    route, is_closed = angle_route(angles)
+    centres, targets = laid_out(np.hstack([poses[:, :, 3], targets]), angles, route, is_closed, typical)
+    share = np.arange(frames) / frames
+    share = share if is_closed else (1 - np.cos(2 * np.pi * share)) / 2  # there and back, slow where it turns
+    centre, target = sampled(centres, share, is_closed), sampled(targets, share, is_closed)
+    _, nearest = cKDTree(poses[:, :, 3]).query(centre)
+    rotation = looking(unit(target - centre, poses[nearest, :, 2]), up)
+    near, far = bounds_at(cameras, centre)
+    lens = replace(median_lens(cameras, size), near=near, far=far)
+    return [posed(lens, np.column_stack([r, c])) for r, c in zip(rotation, centre, strict=True)]
+
+
+def between(stops: Sequence[Camera], frames: int) -> list[Camera]:
+    """A flight from camera to camera, easing in and out; the first and last frame are the first and last stop exactly
+    (a single frame is the first stop).
+
+    Centres go straight between two stops, as the chord stays among the cameras where an arc would bulge out of them,
+    and two photos alone do not tell what the arc should go around. Through several stops they follow a monotone cubic,
+    which never overshoots, rotations a spline with continuous angular velocity (of two: slerp), and focal lengths and
+    depth bounds are interpolated in their logarithms. Size: that of the first stop, to which the others are `resized`.
+
+    Raises:
+        CrossrayError: fewer than two stops, or a number of frames outside 1 to MAX_FRAMES.
+    """
+    check_count(frames)
+    if len(stops) < 2:
+        raise CrossrayError(f"a flight needs two cameras at least, and has {len(stops)}")
+    first = stops[0]
+    stops = [first, *(resized(stop, first.width, first.height) for stop in stops[1:])]
+    poses = np.array([stop.pose for stop in stops])
+    rotations = Rotation.from_matrix(poses[:, :, :3])
+    lengths = np.log([(stop.fx, stop.fy, stop.near, stop.far) for stop in stops])
+    values = np.hstack([poses[:, :, 3], lengths, [(stop.cx, stop.cy) for stop in stops]])
+    times = travel_times(poses[:, :, 3], rotations)
+    share = np.arange(frames) / max(frames - 1, 1)
+    moments = times[-1] * share * share * (3 - 2 * share)
+    found = PchipInterpolator(times, values)(moments)
+    found[:, 3:7] = np.exp(found[:, 3:7])
+    turned = RotationSpline(times, rotations)(moments).as_matrix()
+    cameras = []
+    for rotation, (x, y, z, fx, fy, near, far, cx, cy) in zip(turned, found.tolist(), strict=True):
+        lens = replace(first, fx=fx, fy=fy, cx=cx, cy=cy, near=near, far=far)
+        cameras.append(posed(lens, np.column_stack([rotation, (x, y, z)])))
+    cameras[-1:] = [stops[-1]]
+    cameras[0] = first
+    return cameras
+
+
+# ---------------------------------------------------------------------------------------------------- parts of a loop
+
+
+def median_distance(cameras: Sequence[Camera]) -> float:
+    """How far away things are in the median camera, roughly: the middle of its depth bounds."""
+    return float(np.median([(camera.near + camera.far) / 2 for camera in cameras]))
+
+
+def looked_at(poses: np.ndarray, up: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of cameras (N, 3, 4): the point on each optical axis that is nearest to their focus (N, 3), and each camera's
+    angle around it (N,) in radians.
+
+    Cameras that look outwards, as in a room, are ordered by where they look; their angle is that of a camera on the
+    other side that looks inwards.
+    """
+    centres, forwards = poses[:, :, 3], poses[:, :, 2]
+    focus = focus_of(poses, distance)
+    depth = ((focus - centres) * forwards).sum(1)
+    inwards = np.median(depth) > 0.05 * distance
+    typical = float(np.median(depth)) if inwards else distance
+    targets = centres + np.clip(depth, typical / 2, typical * 2)[:, None] * forwards
+    outwards = centres - focus if inwards else -forwards
+    ahead = looking(unit(median_of(forwards), forwards[0]), up)[:, 0]  # horizontal: angle zero is across the main view
+    side = np.cross(up, ahead)
+    return targets, np.arctan2(outwards @ side, outwards @ ahead)
+
+
+def angle_route(angles: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The angles (DENSE,) along which a loop goes, and whether they are a full circle: where no gap between neighbours
+    is wider than GAP. Else they are those of the largest group of cameras between such gaps, without its TAILS.
+    """
+    order = np.sort(angles)
+    gaps = np.diff(order, append=order[0] + 2 * np.pi)
+    breaks = np.flatnonzero(gaps > GAP)
+    if not len(breaks):
+        return order[0] + np.linspace(0, 2 * np.pi, DENSE, endpoint=False), True
+    unrolled = np.roll(order, -breaks[0] - 1)
+    unrolled = np.where(unrolled < unrolled[0], unrolled + 2 * np.pi, unrolled)
+    groups = np.split(unrolled, np.flatnonzero(np.diff(unrolled) > GAP) + 1)
+    low, high = np.percentile(max(groups, key=len), TAILS)
+    return np.linspace(low, high, DENSE), False
+
+
+def laid_out(
+    seen: np.ndarray, angles: np.ndarray, route: np.ndarray, is_closed: bool, distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and targets (DENSE, 3) of a loop at equal steps, from those of the cameras, side by side in `seen`
+    (N, 6), at their angles: a robust local regression over angles, rounded. `distance` weighs turning against moving.
+    """
+    band = min(BAND, max(float(np.ptp(route)) / 6, 1e-6))
+    off = np.angle(np.exp(1j * (route[:, None] - angles)))
+    weights = np.exp(-((off / band) ** 2) / 2)  # above 0: no gap on the route is wider than some bands
+    found = weighted_median(seen, weights / weights.sum(1, keepdims=True))
+    for _ in range(2):  # equal steps; rounded; equal again
+        found = even(found, is_closed, distance)
+        found = gaussian_filter1d(found, SMOOTHING * DENSE, axis=0, mode="wrap" if is_closed else "nearest")
+    found = even(found, is_closed, distance)
+    return found[:, :3], found[:, 3:]
+
+
+def even(found: np.ndarray, is_closed: bool, distance: float) -> np.ndarray:
+    """Rows (DENSE, 6) of centres and targets at equal steps along them; a step is as long as the centre moves and the
+    view turns, in lengths of `distance`.
+    """
+    line = np.vstack([found, found[:1]]) if is_closed else found
+    forward = unit(line[:, 3:] - line[:, :3], np.eye(3)[2])
+    steps = np.linalg.norm(np.diff(line[:, :3], axis=0), axis=1) / distance + np.linalg.norm(
+        np.diff(forward, axis=0), axis=1
+    )
+    along = np.concatenate([[0], np.cumsum(steps + 1e-9)])
+    wanted = np.linspace(0, along[-1], DENSE, endpoint=not is_closed)
+    return np.column_stack([np.interp(wanted, along, column) for column in line.T])
+
+
+def sampled(rows: np.ndarray, share: np.ndarray, is_closed: bool) -> np.ndarray:
+    """Rows (F, D) of a loop laid out in rows (DENSE, D), at shares (F,) in [0, 1] of its length; of a closed one the
+    first row follows the last.
+    """
+    line = np.vstack([rows, rows[:1]]) if is_closed else rows
+    return np.column_stack([np.interp(share * (len(line) - 1), np.arange(len(line)), column) for column in line.T])
+
+
+def median_lens(cameras: Sequence[Camera], size: tuple[int, int] | None) -> Camera:
+    """A centred camera with square pixels that sees across its shorter side what the median camera sees there."""
+    shorter = [min(camera.width, camera.height) for camera in cameras]
+    focal = float(np.median([math.sqrt(c.fx * c.fy) / n for c, n in zip(cameras, shorter, strict=True)]))
+    if size is None:
+        height = even_pixels(float(np.median(shorter)))
+        size = even_pixels(height * ASPECT), height
+    width, height = size
+    if min(size) < 1:
+        raise CrossrayError(f"a picture of {width} x {height} pixels: each side needs one at least")
+    f = focal * min(size)
+    return replace(cameras[0], width=width, height=height, fx=f, fy=f, cx=width / 2, cy=height / 2)
+
+
+def even_pixels(length: float) -> int:
+    """The nearest even number of pixels, as films want it; 2 at least."""
+    return max(2, round(length / 2) * 2)
+
+
+def travel_times(centres: np.ndarray, rotations: Rotation) -> np.ndarray:
+    """When a flight passes each of its stops (N,), from 0 on, so that it is about equally fast throughout: a way as
+    long as the average one takes as much as the average turn. Every leg takes some time, also one that leads nowhere.
+    """
+    ways = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    turns = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    legs = ways / max(ways.mean(), 1e-9) + turns / max(turns.mean(), 1e-9)
+    return np.concatenate([[0], np.cumsum(legs + 1e-2)])
+
+
+def check_count(frames: int) -> None:
+    """CrossrayError for a number of frames that no path has."""
+    if not 1 <= frames <= MAX_FRAMES:
+        raise CrossrayError(f"a camera path of {frames} frames: it needs 1 to {MAX_FRAMES}")
