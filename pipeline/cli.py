@@ -454,6 +454,47 @@ def export(
 
 
 @app.command()
+def view(
+    run: Annotated[Path, typer.Argument(help="Folder of a trained run.")],
+    host: Annotated[str, typer.Option(help="Address to listen at; by default this machine's own browsers alone.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen at; 0: any free one.")] = 8080,
+    size: Annotated[int, typer.Option(min=64, max=4096, help="Long side of a sharp picture, pixels.")] = 640,
+    step: Annotated[int | None, typer.Option(help="Checkpoint to look at; the newest by default.")] = None,
+) -> None:
+    """Fly through a trained scene in a browser, in the light of any photo; record a camera path for `render`."""
+    from pipeline.viewer.server import view_run
+
+    view_run(run, host, port, size, step, say=print_line)
+
+
+@app.command()
+def figure(
+    kind: Annotated[str, typer.Argument(help="transfer, unseen, interpolation, masks, depth or rays.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a trained run; for rays also of a study.")],
+    out: Annotated[Path, typer.Option(help="Folder for the figure, or the name of its PNG or PDF.")],
+    photos: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Photos of the scene, by name, or image files; chosen by default.")
+    ] = "",
+    views: Annotated[str, typer.Option(metavar="A,B,...", help="Views, by their photos; test views by default.")] = "",
+    appearance: Annotated[
+        list[str], typer.Option(metavar="FILE", help="transfer: a photo of another place, beside these; several.")
+    ] = [],  # noqa: B006
+    columns: Annotated[int | None, typer.Option(help="Pictures side by side, of those that are chosen.")] = None,
+    step: Annotated[int | None, typer.Option(help="Checkpoint to show; the newest by default.")] = None,
+) -> None:
+    """A figure of the paper for a trained run, for print: PNG (300 dpi), PDF, and a record of what it shows."""
+    from pipeline.figures import Order, make_figure
+
+    def names(text: str) -> tuple[str, ...]:
+        return tuple(name.strip() for name in text.split(",") if name.strip())
+
+    files = make_figure(kind, run, out, Order(names(photos), names(views), tuple(appearance), columns, step))
+    print_line(f"{files[0]}, {files[1].name}, {files[2].name}")
+
+
+@app.command()
 def status(
     runs: Annotated[list[Path], typer.Argument(help="Runs, or folders of runs.")] = [Path("runs")],  # noqa: B006
 ) -> None:

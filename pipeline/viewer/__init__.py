@@ -1,0 +1,1 @@
+"""`crossray view`: a trained scene in a browser, in the light of any photo."""
