@@ -115,6 +115,26 @@ def landmark(
 
 
 @app.command()
+def ingest(
+    photos: Annotated[Path, typer.Argument(help="Folder of photos, or a nerfstudio transforms.json.")],
+    out: Annotated[Path, typer.Option(help="Folder for the scene.")],
+    matching: Annotated[
+        str, typer.Option(help="Pairs to compare: auto, exhaustive, sequential (a film's frames) or nearest.")
+    ] = "auto",
+    test_every: Annotated[int, typer.Option(min=0, help="Every so many photos one is for testing; 0: none.")] = 8,
+) -> None:
+    """Make a posed scene of a folder of photos. Again: goes on from where it was."""
+    from pipeline.ingest import ingest as make_scene
+    from pipeline.launch.tasks import ray_tasks
+
+    with ray_tasks() as mapper:
+        summary = make_scene(photos, out, mapper=mapper, matching=matching, test_every=test_every)
+    Console(width=None if sys.stdout.isatty() else 160).print(summary.table())
+    print_line(f"{out}: a scene of {len(summary.registered)} photos; {out / 'ingest' / 'cameras.png'} shows it")
+    print_line(f"crossray run jobs/train_scene_cpu.yaml --set scene.path={out} --set name={out.resolve().name}")
+
+
+@app.command()
 def run(
     job: Annotated[Path, typer.Argument(help="A job file, for example jobs/train_scene.yaml.")],
     settings: Settings = [],  # noqa: B006 (typer reads it once)

@@ -69,8 +69,8 @@ def view_rays(camera: Pinhole, pixel_center: float, device: torch.device, stride
         torch.arange(stride // 2, camera.width, stride, device=device),
         indexing="ij",
     )
-    intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], device=device)
-    c2w = torch.tensor(camera.c2w, device=device)
+    intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float32, device=device)
+    c2w = torch.tensor(camera.c2w, dtype=torch.float32, device=device)
     origins, directions = pixel_rays(cols.flatten(), rows.flatten(), intrinsics, c2w, pixel_center)
     count = len(origins)
     return Rays(origins, directions, origins.new_full((count,), camera.near), origins.new_full((count,), camera.far))

@@ -12,6 +12,8 @@ import numpy as np
 from pipeline.errors import CrossrayError
 from pipeline.manifest import CameraRecord, Row
 
+MAX_SIDE = 2**14  # pixels that a view is asked for: H.264 has no more
+
 
 @dataclass(frozen=True)
 class Camera:

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from pipeline.errors import CrossrayError
-from pipeline.views.camera import Camera, posed
-from pipeline.views.path import CameraPath, Frame
+from pipeline.views.camera import MAX_SIDE, Camera, posed
+from pipeline.views.path import FASTEST, SLOWEST, CameraPath, Frame
 from pipeline.views.smooth import bounds_at
 
 MAX_BYTES = 2**28  # of a file: MAX_FRAMES take about 100 MB
@@ -25,11 +25,11 @@ ROTATION_TOLERANCE = 5e-3  # of R^T R from 1: poses written with three digits ar
 ORIGIN = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 KEYFRAMES = 24  # that are written for editors, at most
 
-Side = Annotated[int, Field(ge=1, le=16384, strict=False)]  # 640.0 is one, too
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE, strict=False)]  # 640.0 is one, too
 Coordinate = Annotated[FiniteFloat, Field(ge=-FAR_AWAY, le=FAR_AWAY)]
 Weights = Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(max_length=1000)]
 Matrix12 = Annotated[list[Coordinate], Field(min_length=12, max_length=16)]
-FramesPerSecond = Annotated[float, Field(gt=0, le=1000)]
+FramesPerSecond = Annotated[float, Field(ge=SLOWEST, le=FASTEST)]
 
 
 class Foreign(BaseModel):

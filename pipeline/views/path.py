@@ -6,7 +6,6 @@ trajectories of nerfbaselines.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from pipeline.errors import CrossrayError
@@ -14,6 +13,7 @@ from pipeline.views.camera import Camera
 
 FPS = 30.0  # frames a second, where nobody says otherwise
 MAX_FRAMES = 100_000  # of a path: about an hour
+SLOWEST, FASTEST = 1e-3, 1e3  # frames a second that films and files hold
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class CameraPath:
     """The frames of a film, all of one size.
 
     Raises:
-        CrossrayError: no frame or more than MAX_FRAMES, frames of two sizes, frames per second that are no positive
-            number, or weights that do not fit the appearances.
+        CrossrayError: no frame or more than MAX_FRAMES, frames of two sizes, frames per second outside SLOWEST to
+            FASTEST, or weights that do not fit the appearances.
     """
 
     frames: tuple[Frame, ...]
@@ -41,8 +41,10 @@ class CameraPath:
     def __post_init__(self) -> None:
         if not 1 <= len(self.frames) <= MAX_FRAMES:
             raise CrossrayError(f"a camera path of {len(self.frames)} frames: it needs 1 to {MAX_FRAMES}")
-        if not (math.isfinite(self.fps) and self.fps > 0):
-            raise CrossrayError(f"a camera path with {self.fps:g} frames per second: it needs a positive number")
+        if not SLOWEST <= self.fps <= FASTEST:
+            raise CrossrayError(
+                f"a camera path with {self.fps:g} frames per second: it needs {SLOWEST:g} to {FASTEST:g}"
+            )
         size = self.size
         for i, frame in enumerate(self.frames):
             if (frame.camera.width, frame.camera.height) != size:

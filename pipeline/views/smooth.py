@@ -46,8 +46,8 @@ def orbit(cameras: Sequence[Camera], frames: int, size: tuple[int, int] | None =
     """A closed loop through training cameras: around what they look at where they surround it, else along them and
     back; it starts and ends without a jump.
 
-    The field of view across the shorter side is the median of the cameras': a wide picture then shows no more above and
-    below than photos do. Depth bounds are `bounds_at`. Memory: a few DENSE x len(cameras) float64.
+    The field of view across the shorter side follows that of the cameras around: a wide picture then shows no more
+    above and below than their photos do. Depth bounds are `bounds_at`. Memory: a few DENSE x len(cameras) float64.
 
     Args:
         size: width and height of the pictures; by default 3:2, as high as the photos' shorter sides in the median.
@@ -63,15 +63,19 @@ def orbit(cameras: Sequence[Camera], frames: int, size: tuple[int, int] | None =
     typical = median_distance(cameras)
     targets, angles = looked_at(poses, up, typical)
     route, is_closed = angle_route(angles)
-    centres, targets = laid_out(np.hstack([poses[:, :, 3], targets]), angles, route, is_closed, typical)
+    focal = np.log([[math.sqrt(c.fx * c.fy) / min(c.width, c.height)] for c in cameras])
+    rows = laid_out(np.hstack([poses[:, :, 3], targets, focal]), angles, route, is_closed, typical)
     share = np.arange(frames) / frames
     share = share if is_closed else (1 - np.cos(2 * np.pi * share)) / 2  # there and back, slow where it turns
-    centre, target = sampled(centres, share, is_closed), sampled(targets, share, is_closed)
+    centre, target, focal = np.split(sampled(rows, share, is_closed), (3, 6), axis=1)
     _, nearest = cKDTree(poses[:, :, 3]).query(centre)
     rotation = looking(unit(target - centre, poses[nearest, :, 2]), up)
     near, far = bounds_at(cameras, centre)
-    lens = replace(median_lens(cameras, size), near=near, far=far)
-    return [posed(lens, np.column_stack([r, c])) for r, c in zip(rotation, centre, strict=True)]
+    lens = replace(centred(cameras, size), near=near, far=far)
+    return [
+        posed(replace(lens, fx=f, fy=f), np.column_stack([r, c]))
+        for r, c, f in zip(rotation, centre, (np.exp(focal[:, 0]) * min(lens.width, lens.height)).tolist(), strict=True)
+    ]
 
 
 def between(stops: Sequence[Camera], frames: int) -> list[Camera]:
@@ -153,29 +157,28 @@ def angle_route(angles: np.ndarray) -> tuple[np.ndarray, bool]:
     return np.linspace(low, high, DENSE), False
 
 
-def laid_out(
-    seen: np.ndarray, angles: np.ndarray, route: np.ndarray, is_closed: bool, distance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and targets (DENSE, 3) of a loop at equal steps, from those of the cameras, side by side in `seen`
-    (N, 6), at their angles: a robust local regression over angles, rounded. `distance` weighs turning against moving.
+def laid_out(seen: np.ndarray, angles: np.ndarray, route: np.ndarray, is_closed: bool, distance: float) -> np.ndarray:
+    """Rows (DENSE, 7) of a loop at equal steps: centre, target and the focal length's logarithm, from those of the
+    cameras, side by side in `seen` (N, 7), at their angles: a local regression over angles, robust but for the focal
+    length, rounded. `distance` weighs turning against moving.
     """
     band = min(BAND, max(float(np.ptp(route)) / 6, 1e-6))
     off = np.angle(np.exp(1j * (route[:, None] - angles)))
     weights = np.exp(-((off / band) ** 2) / 2)  # above 0: no gap on the route is wider than some bands
-    found = weighted_median(seen, weights / weights.sum(1, keepdims=True))
+    weights /= weights.sum(1, keepdims=True)
+    found = np.hstack([weighted_median(seen[:, :6], weights), weights @ seen[:, 6:]])
     for _ in range(2):  # equal steps; rounded; equal again
         found = even(found, is_closed, distance)
         found = gaussian_filter1d(found, SMOOTHING * DENSE, axis=0, mode="wrap" if is_closed else "nearest")
-    found = even(found, is_closed, distance)
-    return found[:, :3], found[:, 3:]
+    return even(found, is_closed, distance)
 
 
 def even(found: np.ndarray, is_closed: bool, distance: float) -> np.ndarray:
-    """Rows (DENSE, 6) of centres and targets at equal steps along them; a step is as long as the centre moves and the
+    """Rows (DENSE, 7), as `laid_out` has them, at equal steps along them; a step is as long as the centre moves and the
     view turns, in lengths of `distance`.
     """
     line = np.vstack([found, found[:1]]) if is_closed else found
-    forward = unit(line[:, 3:] - line[:, :3], np.eye(3)[2])
+    forward = unit(line[:, 3:6] - line[:, :3], np.eye(3)[2])
     steps = np.linalg.norm(np.diff(line[:, :3], axis=0), axis=1) / distance + np.linalg.norm(
         np.diff(forward, axis=0), axis=1
     )
@@ -192,18 +195,15 @@ def sampled(rows: np.ndarray, share: np.ndarray, is_closed: bool) -> np.ndarray:
     return np.column_stack([np.interp(share * (len(line) - 1), np.arange(len(line)), column) for column in line.T])
 
 
-def median_lens(cameras: Sequence[Camera], size: tuple[int, int] | None) -> Camera:
-    """A centred camera with square pixels that sees across its shorter side what the median camera sees there."""
-    shorter = [min(camera.width, camera.height) for camera in cameras]
-    focal = float(np.median([math.sqrt(c.fx * c.fy) / n for c, n in zip(cameras, shorter, strict=True)]))
+def centred(cameras: Sequence[Camera], size: tuple[int, int] | None) -> Camera:
+    """A camera of this size, by default of the median camera's, whose principal point is its middle."""
     if size is None:
-        height = even_pixels(float(np.median(shorter)))
+        height = even_pixels(float(np.median([min(camera.width, camera.height) for camera in cameras])))
         size = even_pixels(height * ASPECT), height
     width, height = size
     if min(size) < 1:
         raise CrossrayError(f"a picture of {width} x {height} pixels: each side needs one at least")
-    f = focal * min(size)
-    return replace(cameras[0], width=width, height=height, fx=f, fy=f, cx=width / 2, cy=height / 2)
+    return replace(cameras[0], width=width, height=height, cx=width / 2, cy=height / 2)
 
 
 def even_pixels(length: float) -> int:

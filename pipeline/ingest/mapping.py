@@ -1,0 +1,192 @@
+"""Poses from matches, and doubts about them.
+
+COLMAP's mapper often returns models that look healthy and are wrong. So settings are tried in a fixed order, all models
+of each try are looked at, cameras that cannot be are taken out where the rest is sound, and only a sound model is used.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.colmap import import_pycolmap
+from pipeline.errors import CrossrayError
+from pipeline.files import atomic_write
+from pipeline.scene import SceneError, check_model, depth_bounds
+
+# name, seed, options of the mapper
+TRIES: tuple[tuple[str, int, dict[str, bool]], ...] = (
+    ("default", 0, {}),
+    ("seed-1", 1, {}),
+    ("fixed-distortion", 0, {"ba_refine_extra_params": False}),
+    ("strict", 0, {"structure_less_registration_fallback": False}),
+    ("strict-fixed-distortion", 1, {"ba_refine_extra_params": False, "structure_less_registration_fallback": False}),
+    ("seed-2", 2, {}),
+)
+ENOUGH = 0.95  # share of the photos that can be registered: no further try
+MOST_BAD = 0.25  # share of the cameras of a model that may be dropped for the rest to be believed
+LEAST_PHOTOS = 3
+STRONG = 30  # inliers of a pair: what the mapper needs to register a photo
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model of a try: `photos` are those that stay, `bad` those that were dropped -> why; `unsound` why it cannot
+    be used, or empty.
+    """
+
+    folder: str
+    photos: list[str]
+    points: int
+    error: float  # mean reprojection error, pixels
+    bad: dict[str, str] = field(default_factory=dict)
+    unsound: str = ""
+
+
+@dataclass(frozen=True)
+class Try:
+    """A try and the models that came out of it, the best first."""
+
+    name: str
+    models: list[Model]
+
+    @property
+    def best(self) -> Model | None:
+        """The sound model with most photos."""
+        return next((m for m in self.models if not m.unsound), None)
+
+    def told(self) -> str:
+        """How it ended, in words."""
+        return f"{self.name}: " + ("; ".join(told(m) for m in self.models) or "no model")
+
+
+def told(model: Model) -> str:
+    """A model in words."""
+    bad = f", {len(model.bad)} bad cameras dropped" if model.bad and not model.unsound else ""
+    return f"{len(model.photos)} photos{bad}, {model.unsound or f'sound, {model.points} points'}"
+
+
+def find_poses(
+    folder: Path, wanted: int, run: Callable[[int, Path], None], tries: tuple = TRIES
+) -> tuple[Try, Model, list[Try]]:
+    """Try settings until a sound model has nearly all of the `wanted` photos; returns the try that is used, its model
+    and all tries. Tries that are in `folder` already are read.
+
+    Raises:
+        CrossrayError: no try gave a sound model; the message tells each.
+    """
+    done: list[Try] = []
+    for index, (name, _, _) in enumerate(tries):
+        path = folder / f"{index}-{name}"
+        if not (path / "verdict.json").exists():
+            run(index, path)
+        done.append(read_try(path))
+        best = done[-1].best
+        if best and len(best.photos) >= ENOUGH * wanted:
+            break
+    sound = [t for t in done if t.best]
+    if not sound:
+        lines = "".join(f"\n  {t.told()}" for t in done)
+        raise CrossrayError(
+            f"no sound model of the photos was found. Photos need to overlap and be taken from different places; more "
+            f"of them help. Tried:{lines}"
+        )
+    chosen = max(sound, key=lambda t: len(t.best.photos) if t.best else 0)
+    assert chosen.best is not None
+    return chosen, chosen.best, done
+
+
+def read_try(folder: Path) -> Try:
+    """A try that was completed."""
+    record = json.loads((folder / "verdict.json").read_text())
+    return Try(record["name"], [Model(**m) for m in record["models"]])
+
+
+def run_try(database: str, photos: str, folder: str, index: int) -> None:
+    """Map with the settings of one try and judge every model; `folder` appears when all is there."""
+    pycolmap = import_pycolmap()
+    name, seed, settings = TRIES[index]
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = LEAST_PHOTOS
+    options.random_seed = seed
+    for key, value in settings.items():
+        setattr(options, key, value)
+    scratch = Path(folder).with_name(f".{Path(folder).name}.tmp")
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    pycolmap.set_random_seed(seed)
+    found = pycolmap.incremental_mapping(database, photos, scratch, options)
+    models = []
+    for number, reconstruction in sorted(found.items()):
+        kept = scratch / f"model-{number}"
+        models.append(judge(reconstruction, kept.name))
+        kept.mkdir()
+        reconstruction.write_binary(kept)
+        shutil.rmtree(scratch / str(number), ignore_errors=True)
+    models.sort(key=lambda m: (bool(m.unsound), -len(m.photos)))
+    atomic_write(scratch / "verdict.json", json.dumps({"name": name, "models": [asdict(m) for m in models]}, indent=1))
+    shutil.rmtree(folder, ignore_errors=True)
+    scratch.rename(folder)
+
+
+def judge(model: Any, folder: str) -> Model:
+    """Take the cameras out of `model` (a `pycolmap.Reconstruction`) that cannot be, and say whether the rest can."""
+    before = [model.images[i].name for i in model.reg_image_ids()]
+    bad: dict[str, str] = {}
+    for _ in range(3):  # a point may have been seen by the bad cameras alone, a camera have seen such points alone
+        found = bad_cameras(model)
+        bad |= found
+        for image in [i for i in model.images.values() if i.name in found]:
+            model.deregister_frame(image.frame_id)
+        if not found:
+            break
+    names = sorted(model.images[i].name for i in model.reg_image_ids())
+    unsound = ""
+    if len(bad) > MOST_BAD * len(before):
+        unsound = f"{len(bad)} of {len(before)} cameras cannot be ({next(iter(bad.values()))})"
+    elif len(names) < LEAST_PHOTOS:
+        unsound = f"fewer than {LEAST_PHOTOS} photos"
+    else:
+        try:
+            check_model(model)
+        except SceneError as wrong:
+            unsound = str(wrong).partition(": reconstruct")[0]
+    error = float(model.compute_mean_reprojection_error()) if model.points3D else 0.0
+    return Model(folder, names, len(model.points3D), error, bad, unsound)
+
+
+def bad_cameras(model: Any) -> dict[str, str]:
+    """Photo -> what is wrong with its camera, of the registered ones whose camera cannot be."""
+    found = {}
+    points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
+    for image in (model.images[i] for i in model.reg_image_ids()):
+        try:
+            check_model(model, [image])
+            depth_bounds(points, image.cam_from_world().matrix(), image.name)
+        except SceneError as error:
+            found[image.name] = str(error).partition(": reconstruct")[0]
+    return found
+
+
+def components(names: list[str], pairs: dict[tuple[str, str], int]) -> list[set[str]]:
+    """Photos that strong pairs join, the largest group first; photos without any are in none."""
+    group = {n: n for n in names}
+
+    def root(n: str) -> str:
+        while group[n] != n:
+            n = group[n]
+        return n
+
+    for (a, b), count in pairs.items():
+        if count >= STRONG:
+            group[root(a)] = root(b)
+    groups: dict[str, set[str]] = {}
+    for n in names:
+        groups.setdefault(root(n), set()).add(n)
+    return sorted((g for g in groups.values() if len(g) > 1), key=lambda g: (-len(g), min(g)))
