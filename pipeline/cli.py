@@ -437,7 +437,7 @@ def render(
     from pipeline.launch.tasks import in_process, one_gpu_if_any, ray_tasks
     from pipeline.progress import shown
 
-    order = Order(view, appearance, tuple(what.split(",")), size, frames, fps, path_format)
+    order = Order(view, appearance, tuple(word.strip() for word in what.split(",")), size, frames, fps, path_format)
     with ray_tasks(needs=one_gpu_if_any) if use_ray else nullcontext(in_process) as mapper:
         for path in render_film(run, out, order, shown(mapper, "rendering"), step):
             print_line(str(path))

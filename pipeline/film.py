@@ -31,19 +31,20 @@ from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file, atomic_write
 from pipeline.looks import Looks, looks_of, read_looks
 from pipeline.painter import Painter, Picture
+from pipeline.pictures import reason
 from pipeline.render import predicted_mask
 from pipeline.video import about_video, write_video
-from pipeline.views.camera import Camera, camera_of, resized
+from pipeline.views.camera import MAX_SIDE, Camera, camera_of, resized
 from pipeline.views.choose import Stills, views_of
-from pipeline.views.nerfstudio import write_camera_path
+from pipeline.views.nerfstudio import camera_path_text
 from pipeline.views.path import CameraPath
-from pipeline.views.trajectory import write_trajectory
+from pipeline.views.trajectory import trajectory_text
 
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 WHAT = ("rgb", "depth", "mask", "accumulation")
 LAYOUTS = ("nerfstudio", "nerfbaselines")
-MAX_SIDE = 2**15  # pixels
+NOT_WRITTEN = (".png", ".jpg", ".jpeg", ".gif", ".webp", ".avi", ".mov", ".mkv", ".webm")
 SURVEYED, SURVEY_SIDE = 8, "48"  # shots whose depths set a film's scale, at most, and their longer side
 RECORD = "film.json"
 
@@ -136,21 +137,24 @@ def render_film(run: Path, out: Path, order: Order, mapper: Mapper = map, step: 
     """
     painter = Painter(run, step)
     views = chosen_views(painter, order)
-    is_film = isinstance(views, CameraPath)
-    check_order(order, out, is_film, painter)
+    check_order(order, out, views, painter)
+    order = replace(order, what=tuple(what for what in WHAT if what in order.what))
     looks = chosen_looks(painter, order, views)
-    if isinstance(views, CameraPath) and out.suffix == ".json":
+    if isinstance(views, CameraPath) and out.suffix.lower() == ".json":
         write_path(out, views, looks, painter, order.layout)
         return [out]
     about = described(painter, order, views, looks)
-    films = film_files(out, order.what) if out.suffix == ".mp4" else {}
+    films = film_files(out, order.what) if out.suffix.lower() == ".mp4" else {}
     if any(path.exists() for path in films.values()):
         check_films(films, about)
-        if all(path.exists() for path in films.values()):
-            return list(films.values())
     folder = out.with_name(f"{out.name}.frames") if films else out
-    claim(folder, about)
+    if films and all(path.exists() for path in films.values()):
+        shutil.rmtree(folder, ignore_errors=True)  # left by a process that was killed once its film was whole
+        return list(films.values())
     shots = shots_of(painter, views, looks, order.what, folder)
+    if isinstance(views, Stills):
+        check_still(painter, shots[0])
+    claim(folder, about)
     if "depth" in order.what:
         depths = depth_range(painter, shots)
         shots = [replace(shot, depths=depths) for shot in shots]
@@ -160,12 +164,13 @@ def render_film(run: Path, out: Path, order: Order, mapper: Mapper = map, step: 
         return [folder]
     for what, path in films.items():
         write_video(path, (as_frame(s.files[what]) for s in shots), views.fps, about)
-    shutil.rmtree(folder)
+    shutil.rmtree(folder, ignore_errors=True)  # another process of the same command may be at it
     return list(films.values())
 
 
-def check_order(order: Order, out: Path, is_film: bool, painter: Painter) -> None:
+def check_order(order: Order, out: Path, views: Stills | CameraPath, painter: Painter) -> None:
     """CrossrayError where parts of an order do not fit each other, before anything is rendered."""
+    is_film = isinstance(views, CameraPath)
     if order.layout not in LAYOUTS:
         raise CrossrayError(f"--path-format {order.layout}: there are {', '.join(LAYOUTS)}")
     unknown = [what for what in order.what if what not in WHAT]
@@ -175,10 +180,19 @@ def check_order(order: Order, out: Path, is_film: bool, painter: Painter) -> Non
         raise CrossrayError(f"--what mask: only photos have masks; --view {order.view} is a path (test, train, NAME)")
     if "mask" in order.what and painter.model.spec.transient == "none":
         raise CrossrayError(f"--what mask: {painter.run} has no masks (model.transient: none)")
-    if out.suffix in (".mp4", ".json") and not is_film:
+    if out.suffix.lower() in (".mp4", ".json") and not is_film:
         raise CrossrayError(f"--out {out}: --view {order.view} gives single pictures; name a folder for them")
-    if out.suffix not in (".mp4", ".json", ""):
+    if out.suffix.lower() == ".mp4" and isinstance(views, CameraPath) and min(views.size) < 2:
+        raise CrossrayError(f"--out {out}: a film of {views.size[0]} x {views.size[1]} pixels; each side needs two")
+    if out.suffix.lower() in NOT_WRITTEN:
         raise CrossrayError(f"--out {out}: a folder for PNGs, film.mp4, or path.json for the camera path alone")
+
+
+def check_still(painter: Painter, shot: Shot) -> None:
+    """CrossrayError where a photo has no appearance of its own or no mask; all stills are of one split."""
+    look_of(painter, shot)
+    if "mask" in shot.files:
+        mask_of(painter, shot)
 
 
 def chosen_views(painter: Painter, order: Order) -> Stills | CameraPath:
@@ -194,7 +208,7 @@ def chosen_views(painter: Painter, order: Order) -> Stills | CameraPath:
     if isinstance(views, Stills):
         return Stills(tuple((name, at_size(camera, order.size)) for name, camera in views.views))
     frames = tuple(replace(frame, camera=at_size(frame.camera, order.size)) for frame in views.frames)
-    return replace(views, frames=frames, fps=order.fps or views.fps)
+    return replace(views, frames=frames, fps=views.fps if order.fps is None else order.fps)
 
 
 def at_size(camera: Camera, size: str | None) -> Camera:
@@ -202,8 +216,10 @@ def at_size(camera: Camera, size: str | None) -> Camera:
     if size is None:
         return camera
     numbers = size.lower().split("x")
-    if len(numbers) > 2 or not all(n.isdecimal() and 1 <= int(n) <= MAX_SIDE for n in numbers):
-        raise CrossrayError(f"--size {size}: give the longer side in pixels, as in 640, or both, as in 640x480")
+    if len(numbers) > 2 or not all(n.isdecimal() and len(n) < 9 and 1 <= int(n) <= MAX_SIDE for n in numbers):
+        raise CrossrayError(
+            f"--size {size}: give the longer side in pixels, as in 640, or both, as in 640x480; {MAX_SIDE} at most"
+        )
     if len(numbers) == 2:
         return resized(camera, int(numbers[0]), int(numbers[1]))
     share = int(size) / max(camera.width, camera.height)
@@ -215,6 +231,12 @@ def chosen_looks(painter: Painter, order: Order, views: Stills | CameraPath) -> 
     if isinstance(views, Stills):
         return looks_of(painter, order.appearance, [name for name, _ in views.views], film=False)
     if order.appearance is None and views.appearances and painter.has_appearance:
+        bare = [i for i, frame in enumerate(views.frames) if frame.weights is None]
+        if bare:
+            raise CrossrayError(
+                f"--view {order.view}: frame {bare[0]} has no appearance_weights, and the file names appearances; give "
+                "it some, or choose an appearance for all frames with --appearance"
+            )
         return read_looks(painter, views.appearances, [frame.weights for frame in views.frames])
     return looks_of(painter, order.appearance, [""] * len(views.frames), film=True)
 
@@ -254,8 +276,10 @@ def claim(folder: Path, about: str) -> None:
     """Make the folder that of these pictures. CrossrayError: it holds other things, or other pictures."""
     record = folder / RECORD
     if record.is_file():
-        if record.read_text() != about + "\n":
-            raise CrossrayError(f"{folder} holds other pictures ({record} says which); --out names another folder")
+        if record.read_bytes() != f"{about}\n".encode():
+            raise CrossrayError(
+                f"{folder} holds other pictures ({record} says which); remove it, or --out names another place"
+            )
     elif folder.exists() and any(p.suffix != ".tmp" for p in folder.iterdir()):
         raise CrossrayError(f"{folder} holds other things; --out names another folder")
     else:
@@ -301,18 +325,34 @@ def depth_range(painter: Painter, shots: Sequence[Shot]) -> tuple[float, float]:
 
 
 def write_path(out: Path, film: CameraPath, looks: Looks, painter: Painter, layout: str) -> None:
-    """Write the camera path, with its appearances, for other programs and for `--view`."""
+    """Write the camera path, with its appearances, for other programs and for `--view`.
+
+    Raises:
+        CrossrayError: `out` is there, and is something else.
+    """
     frames = (replace(frame, weights=w) for frame, w in zip(film.frames, looks.weights, strict=True))
     film = CameraPath(tuple(frames), film.fps, looks.names)
     manifest, train = painter.photos.manifest, painter.photos.indices("train")
     if layout == "nerfstudio":
-        write_camera_path(out, film, manifest.scene.scale)
+        text = camera_path_text(film, manifest.scene.scale)
     else:
-        write_trajectory(out, film, manifest.scene.scale, [painter.photos.records[i].name for i in train])
+        text = trajectory_text(film, manifest.scene.scale, [painter.photos.records[i].name for i in train])
+    if out.is_file() and out.read_bytes() != text.encode():
+        raise CrossrayError(f"{out} is there already, and is not this path; --out names another file")
+    atomic_write(out, text)
 
 
 def as_frame(path: Path) -> np.ndarray:
-    """A picture as a frame of a film: three channels; a last odd row or column is left out, as H.264 wants it."""
-    with Image.open(path) as image:
-        pixels = np.asarray(image.convert("RGB"))
+    """A picture as a frame of a film: three channels; a last odd row or column is left out, as H.264 wants it.
+
+    Raises:
+        CrossrayError: it is gone, or damaged.
+    """
+    try:
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("RGB"))
+    except FileNotFoundError:
+        raise CrossrayError(f"{path} was removed meanwhile; the same command makes it again") from None
+    except Exception as error:  # Pillow's decoders raise whatever they meet
+        raise CrossrayError(f"{path} is damaged ({reason(error)}); remove it, and give the same command") from error
     return pixels[: len(pixels) // 2 * 2, : pixels.shape[1] // 2 * 2]

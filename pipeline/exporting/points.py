@@ -61,11 +61,11 @@ def write_points(
             progress.update((index + 1) / len(parts), f"{index + 1} of {len(parts)} views")
     finally:
         progress.close()
-    number = sum(len(np.load(part, mmap_mode="r")) for part in parts)
+    number = sum(len(np.load(part, mmap_mode="r", allow_pickle=False)) for part in parts)
     with atomic_file(path) as file:
         file.write(header(number).encode())
         for part in parts:
-            file.write(np.load(part).tobytes())
+            file.write(np.load(part, allow_pickle=False).tobytes())
     log.info("points: %d of %d rays meet one surface that another view agrees to", number, rays)
 
 

@@ -98,6 +98,11 @@ def read_camera_path(path: Path, scale: float, train: Mapping[str, Camera]) -> C
 
 def write_camera_path(path: Path, film: CameraPath, scale: float) -> None:
     """Write a path, in scene units, as camera_path.json; the file is whole or as it was before."""
+    atomic_write(path, camera_path_text(film, scale))
+
+
+def camera_path_text(film: CameraPath, scale: float) -> str:
+    """The content of a camera_path.json of a path in scene units."""
     width, height = film.size
     frames: list[dict[str, Any]] = []
     for frame in film.frames:
@@ -132,4 +137,4 @@ def write_camera_path(path: Path, film: CameraPath, scale: float) -> None:
         "camera_path": frames,
         **({"appearances": [{"image": name} for name in film.appearances]} if film.appearances else {}),
     }
-    atomic_write(path, json.dumps(content, indent=1) + "\n")
+    return json.dumps(content, indent=1) + "\n"

@@ -115,7 +115,14 @@ def name_of(appearance: Appearance, photos: Sequence[str], where: str) -> str:
 
 
 def write_trajectory(path: Path, film: CameraPath, scale: float, train: Sequence[str]) -> None:
-    """Write a path, in scene units, as a trajectory; the file is whole or as it was before.
+    """Write a path, in scene units, as a trajectory; the file is whole or as it was before. Arguments as
+    `trajectory_text`.
+    """
+    atomic_write(path, trajectory_text(film, scale, train))
+
+
+def trajectory_text(film: CameraPath, scale: float, train: Sequence[str]) -> str:
+    """The content of a trajectory of a path in scene units.
 
     Args:
         train: names of the training photos. Only where all appearances are among them, they are numbered:
@@ -162,4 +169,4 @@ def write_trajectory(path: Path, film: CameraPath, scale: float, train: Sequence
             {"embedding_train_index": numbers[name], "image": name} if numbered else {"image": name}
             for name in film.appearances
         ]
-    atomic_write(path, json.dumps(content, indent=1) + "\n")
+    return json.dumps(content, indent=1) + "\n"

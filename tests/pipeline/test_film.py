@@ -235,7 +235,7 @@ def test_frames_of_another_film_are_never_mixed_in(run, tmp_path):
 def test_ray_tasks_give_the_same_bytes(run, tmp_path):
     order = Order(frames=3, size="16x12", what=("rgb", "depth"))
     render_film(run, tmp_path / "here", order)
-    with ray_tasks(2, needs=one_gpu_if_any) as mapper:
+    with ray_tasks(1, needs=one_gpu_if_any) as mapper:
         render_film(run, tmp_path / "ray", order, mapper)
     files = sorted(p.relative_to(tmp_path / "here") for p in (tmp_path / "here").rglob("*.png"))
     assert len(files) == 6
@@ -309,6 +309,27 @@ def test_a_film_file_tells_what_it_is_and_odd_sides_are_cut(tmp_path):
     assert about_video(tmp_path / "no.mp4") is None
 
 
+@pytest.mark.parametrize("size", [(64, 96), (720, 1280)])
+def test_a_film_says_which_colours_it_has_and_has_them(tmp_path, size):
+    """Players take a film that says nothing for BT.601 or BT.709 by its size: red would be another red."""
+    colour = np.array([200, 30, 60], np.uint8)
+    write_video(tmp_path / "a.mp4", [np.broadcast_to(colour, (*size, 3)).copy()], 24, "")
+    with av.open(str(tmp_path / "a.mp4")) as opened:
+        codec = opened.streams.video[0].codec_context
+        assert (codec.color_range, codec.colorspace, codec.color_primaries, codec.color_trc) == (1, 1, 1, 1)
+        y, u, v = (np.frombuffer(plane, np.uint8)[0] for plane in next(opened.decode(video=0)).planes)
+    r, g, b = colour / 255  # ITU-R BT.709, 8 bits, limited range
+    luma = 0.2126 * r + 0.7152 * g + 0.0722 * b
+    expected = (16 + 219 * luma, 128 + 224 * (b - luma) / 1.8556, 128 + 224 * (r - luma) / 1.5748)
+    assert np.allclose((y, u, v), expected, atol=1.5)
+
+
+def test_pictures_of_two_sizes_are_no_film(tmp_path):
+    with pytest.raises(CrossrayError, match="10 x 8 pixels after those of 6 x 4"):
+        write_video(tmp_path / "a.mp4", [np.zeros((4, 6, 3), np.uint8), np.zeros((8, 10, 3), np.uint8)], 24, "")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_shot_whose_files_are_there_leaves_them(run, tmp_path):
     brush = Painter(run)
     views = film.chosen_views(brush, Order(view=A))
@@ -338,6 +359,12 @@ def test_a_shot_whose_files_are_there_leaves_them(run, tmp_path):
         (["--out", "o", "--appearance", "missing.jpg"], "'missing.jpg' is neither an image file"),
         (["--out", "o", "--frames", "0"], "0 frames"),
         (["--out", "o", "--fps", "-1"], "-1 frames per second"),
+        (["--out", "o.mp4", "--fps", "0"], "0 frames per second: it needs 0.001 to 1000"),
+        (["--out", "o.mp4", "--fps", "0.0004"], "0.0004 frames per second"),
+        (["--out", "o.mp4", "--fps", "1e20"], "1e+20 frames per second"),
+        (["--out", "o.mp4", "--size", "16x1"], "a film of 16 x 1 pixels; each side needs two"),
+        (["--out", "o.mp4", "--size", "20000x10"], "16384 at most"),
+        (["--out", "o", "--size", "9" * 5000], "16384 at most"),
         (["--out", "p.json", "--path-format", "blender"], "--path-format blender"),
         (["--out", "o", "--step", "7"], "no checkpoint of step 7"),
     ],
@@ -356,9 +383,68 @@ def test_what_a_method_cannot_show_is_refused(trained, tmp_path):
         ("nerf", Order(view=A, appearance=A), "none to choose"),
         ("nerf", Order(view=A, what=("mask",)), "has no masks"),
         ("nerfw", Order(view="test"), "reads no other"),
+        ("hanerf", Order(view="test", what=("mask",)), "has none of"),
     ):
         with pytest.raises(CrossrayError, match=message):
             render_film(trained / "runs" / method, tmp_path / "o", order)
+        assert not (tmp_path / "o").exists()
+
+
+def test_a_path_is_never_written_over_another_file(run, tmp_path):
+    path, order = tmp_path / "path.json", Order(frames=2, size="16x12")
+    render_film(run, path, order)
+    before = path.read_bytes()
+    assert render_film(run, path, order) == [path]
+    for other in (replace(order, frames=3), replace(order, layout="nerfbaselines")):
+        with pytest.raises(CrossrayError, match="not this path"):
+            render_film(run, path, other)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("method", ["crossray", "nerfw", "nerf"])
+def test_a_path_whose_frames_lack_weights_is_refused_or_given_an_appearance(trained, tmp_path, method):
+    path = tmp_path / "path.json"
+    render_film(trained / "runs" / "crossray", path, Order(frames=2, size="16x12", appearance=f"{A}..{B}"))
+    content = json.loads(path.read_text())
+    del content["camera_path"][1]["appearance_weights"]
+    path.write_text(json.dumps(content))
+    run, order = trained / "runs" / method, Order(view=str(path))
+    if method == "nerf":  # has no appearance, and reads none
+        assert render_film(run, tmp_path / "o", order) == [tmp_path / "o"]
+        return
+    with pytest.raises(CrossrayError, match="frame 1 has no appearance_weights"):
+        render_film(run, tmp_path / "o", order)
+    assert render_film(run, tmp_path / "o", replace(order, appearance=A)) == [tmp_path / "o"]
+
+
+def test_kinds_in_another_order_or_twice_are_the_same_films(run, tmp_path):
+    order = Order(frames=2, size="16x12", what=("rgb", "depth"))
+    films = render_film(run, tmp_path / "a.mp4", order)
+    for what in (("depth", "rgb"), ("rgb", "depth", "rgb")):
+        assert render_film(run, tmp_path / "a.mp4", replace(order, what=what)) == films
+
+
+def test_a_record_that_is_no_text_is_of_something_else(run, tmp_path):
+    (tmp_path / "film.json").write_bytes(b"\xff\xfe")
+    with pytest.raises(CrossrayError, match="holds other pictures"):
+        render_film(run, tmp_path, Order(frames=1, size="16"))
+
+
+def test_a_damaged_frame_is_named(run, tmp_path):
+    out, order = tmp_path / "a.mp4", Order(frames=2, size="16x12")
+
+    def damaged(fn, specs):
+        for spec in specs:
+            yield fn(spec)
+        spec.files["rgb"].write_bytes(spec.files["rgb"].read_bytes()[:40])
+
+    with pytest.raises(CrossrayError, match=r"a\.mp4\.frames/rgb/00001\.png is damaged"):
+        render_film(run, out, order, damaged)
+    assert not out.exists()
+    (tmp_path / "a.mp4.frames" / "rgb" / "00001.png").unlink()
+    assert render_film(run, out, order) == [out]
+    with pytest.raises(CrossrayError, match="removed meanwhile"):
+        as_frame(tmp_path / "gone.png")
 
 
 def test_a_folder_of_other_things_is_left_alone(run, tmp_path):
