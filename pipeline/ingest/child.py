@@ -49,7 +49,8 @@ def in_child(
             process.kill()
         process.join()
     if process.exitcode:
-        lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+        printed = log.read_text(errors="replace") if log.exists() else ""
+        lines = [line.strip() for line in printed.splitlines() if line.strip()]
         raise NativeError(f"{fn.__name__}: {lines[-1] if lines else 'died'} (exit status {process.exitcode}; {log})")
 
 

@@ -230,6 +230,8 @@ def test_how_a_child_ends(tmp_path):
     assert (tmp_path / "made").is_dir()
     with pytest.raises(NativeError, match="mkdir: FileExistsError"):
         in_child(os.mkdir, str(tmp_path / "made"), log=tmp_path / "log")
+    with pytest.raises(NativeError, match="mkdir: died"):
+        in_child(os.mkdir, str(tmp_path / "never"), log=tmp_path / "no folder" / "log")
 
 
 @pytest.mark.slow
