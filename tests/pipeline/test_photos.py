@@ -158,7 +158,7 @@ def _open_and_sum(arguments) -> tuple[int, int]:
 
 
 def test_processes_that_start_together_decode_once(shards, cache):
-    with multiprocessing.get_context("fork").Pool(3) as pool:
+    with multiprocessing.get_context("spawn").Pool(3) as pool:  # other tests of this process have left threads
         results = pool.map(_open_and_sum, [(shards, cache)] * 3, chunksize=1)
     assert sum(built for built, _ in results) == 1
     assert len({total for _, total in results}) == 1
