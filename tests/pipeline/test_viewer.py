@@ -765,8 +765,9 @@ def test_cameras_in_the_scene_are_clicked_and_what_is_shown_is_chosen(served, lo
     until_true(page, lambda: panel.standing.wish.camera.pose[:, 3] == pytest.approx(back) and panel.standing.idle)
     target = next(record for record in place.records if record.name == "photo_005.jpg")  # left, not under the panel
     pose = np.array(target.c2w)
-    page.mouse.click(*pixel_of(panel, pose[:, 3] + 0.1 * pose[:, 2]))
-    page.get_by_role("button", name=f"Take the appearance of {target.name}").click()
+    take = page.get_by_role("button", name=f"Take the appearance of {target.name}")
+    click_until(page, pixel_of(panel, pose[:, 3] + 0.1 * pose[:, 2]), take)
+    take.click()
     until_true(page, lambda: np.allclose(panel.client.camera.position, np.array(target.c2w)[:, 3], atol=1e-4))
     assert panel.appearance.first.value == target.name
     page.get_by_role("button", name="Back to the start").click()
@@ -777,6 +778,19 @@ def test_cameras_in_the_scene_are_clicked_and_what_is_shown_is_chosen(served, lo
 
 def others(place):
     return {record.name for record in place.records} - {place.start.name}
+
+
+def click_until(page, pixel, appears):
+    """Click into the scene as a user does: again where the browser had not drawn yet what the server sent."""
+    from playwright.sync_api import TimeoutError as NotYet
+
+    for _ in range(10):
+        page.mouse.click(*pixel)
+        try:
+            return appears.wait_for(timeout=5_000)
+        except NotYet:
+            continue
+    raise AssertionError(f"{appears} did not appear")
 
 
 def pixel_of(panel, point):
