@@ -388,6 +388,7 @@ def test_a_checkpoint_that_was_removed_or_written_anew_is_told_apart(run):
         score_views(task)
 
 
+@pytest.mark.slow
 def test_evaluations_after_training_wait_for_the_process_that_is_at_it(run, monkeypatch):
     """And then find that there is nothing to do."""
     folder = run()
@@ -522,6 +523,7 @@ def test_a_learned_code_is_fitted_to_the_left_half_and_metrics_say_so(run, photo
     assert columns == 25  # of 49: the middle one is in both halves, as in nerfbaselines
 
 
+@pytest.mark.slow
 def test_what_others_read_from_is_said_too(run, quick):
     for method, name, expected in (
         ("crossray", "crnerf-full@R2", "whole"),

@@ -126,6 +126,7 @@ class TestScenes:
 
     @fuzzed
     @given(data=st.data())
+    @pytest.mark.slow
     def test_a_photo(self, scene, tmp_path, data):
         root = self.copy(scene, tmp_path)
         photo = Path("dense/images/photo_001.jpg")

@@ -138,6 +138,7 @@ def test_another_seed_makes_other_photos(scene):
     assert a.light != b.light
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_finished_to_the_same_bytes(scene, tmp_path):
     def dies(fn, specs):
         yield fn(next(iter(specs)))

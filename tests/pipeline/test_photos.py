@@ -157,6 +157,7 @@ def _open_and_sum(arguments) -> tuple[int, int]:
     return len(builds), sum(int(photos.image(i).sum()) for i in range(len(photos)))
 
 
+@pytest.mark.slow
 def test_processes_that_start_together_decode_once(shards, cache):
     with multiprocessing.get_context("spawn").Pool(3) as pool:  # other tests of this process have left threads
         results = pool.map(_open_and_sum, [(shards, cache)] * 3, chunksize=1)

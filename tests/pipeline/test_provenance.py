@@ -9,6 +9,7 @@ import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import pytest
 import torch
 
 from pipeline.provenance import command, commit, provenance
@@ -52,6 +53,7 @@ def test_the_commit_is_that_of_the_checkout() -> None:
     assert (commit() or "").startswith(head.stdout.strip())
 
 
+@pytest.mark.slow
 def test_outside_a_checkout_there_is_no_commit(tmp_path) -> None:
     package = tmp_path / "pipeline"
     package.mkdir()

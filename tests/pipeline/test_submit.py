@@ -73,6 +73,7 @@ class TestStage:
         echoed = subprocess.run(["sh", "-c", f"printf '%s\\n' {command}"], capture_output=True, text=True, check=True)
         assert echoed.stdout.splitlines() == words  # a shell runs it on the cluster
 
+    @pytest.mark.slow
     def test_the_copy_runs(self, job_file, tmp_path):
         folder = tmp_path / "stage"
         command = submit.stage(job_file, ["scene.path=nowhere"], folder)

@@ -352,6 +352,7 @@ def test_a_smaller_view_is_not_timed_again_where_less_of_the_larger_was(monkeypa
     assert calls == [16, 4]  # 10 rays are more than the smaller view has
 
 
+@pytest.mark.slow
 def test_a_method_of_one_appearance_has_a_single_image():
     timing = tiny(inference={"methods": ["nerf"], "images": 1, "appearances": [1], "downscales": [16], "pixels": []})
     rows = inference_rows(timing, Meter(CPU, 0.001), lambda precision: 1.0)

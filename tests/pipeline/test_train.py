@@ -429,6 +429,7 @@ def test_a_budget_of_seconds_is_kept(make):
     assert [p.name for p in committed(checkpoints(job))] == [f"step-{result['steps']:08d}"]
 
 
+@pytest.mark.slow
 def test_a_stopped_budget_goes_on_from_its_clock(make):
     job = make("nerf", seconds=1.0)
     first = train_until(job, 10)
@@ -587,6 +588,7 @@ def test_masks_of_two_origins_are_refused(masked):
     assert cuts == []
 
 
+@pytest.mark.slow
 def test_a_run_is_not_scored_on_masks_that_it_was_not_trained_on(masked):
     job, _ = masked
     ensure_shards(job)
