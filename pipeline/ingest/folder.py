@@ -1,7 +1,7 @@
 """Looking at every file of a folder: a photo, or rejected with a reason.
 
 Accepted photos appear in the workspace under safe names: 8-bit RGB or gray JPEGs and PNGs as links to the files
-themselves, all else (CMYK, 16 bits, alpha, other formats) as RGB PNGs. EXIF orientation is ignored, as everywhere.
+themselves, all else (CMYK, 16 bits, alpha, other formats, photos that their EXIF orientation turns) as RGB PNGs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file
@@ -26,6 +26,7 @@ Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 LEAST_SIDE = 64  # pixels: below, SIFT's largest scales do not fit and no camera is found
 LEAST_PHOTOS = 3
 AS_THEY_ARE = {"JPEG": ".jpg", "PNG": ".png"}
+ORIENTATION, TURNED = 0x0112, range(2, 9)  # EXIF: 1 is upright
 HEIC = (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
 
 
@@ -36,6 +37,7 @@ class File:
     source: Path
     name: str  # relative to the folder
     target: Path
+    upright: bool = True  # turn it as its EXIF orientation says
 
 
 @dataclass(frozen=True)
@@ -83,8 +85,11 @@ def safe_stems(names: list[str]) -> list[str]:
     return stems
 
 
-def look_at(root: Path, files: list[Path], photos: Path, mapper: Mapper) -> list[Seen]:
+def look_at(root: Path, files: list[Path], photos: Path, mapper: Mapper, *, upright: bool = True) -> list[Seen]:
     """Look at each of `files` under `root`, and put the photos into the folder `photos`; in the order of `files`.
+
+    Args:
+        upright: turn photos as their EXIF orientation says; not where poses of the stored pixels are known.
 
     Raises:
         CrossrayError: fewer than three different photos.
@@ -92,7 +97,7 @@ def look_at(root: Path, files: list[Path], photos: Path, mapper: Mapper) -> list
     photos.mkdir(parents=True, exist_ok=True)
     names = [p.relative_to(root).as_posix() if p.is_relative_to(root) else p.as_posix() for p in files]
     stems = safe_stems(names)
-    specs = [File(p.resolve(), n, photos / s) for p, n, s in zip(files, names, stems, strict=True)]
+    specs = [File(p.resolve(), n, photos / s, upright) for p, n, s in zip(files, names, stems, strict=True)]
     found = {seen.name: seen for seen in mapper(look, specs)}
     seen = without_duplicates([found[n] for n in names])
     kept = {s.photo for s in seen if s.photo}
@@ -127,18 +132,22 @@ def look(file: File) -> Seen:
         return Seen(file.name, f"cannot be read ({error.strerror or error})")
     try:
         with Image.open(_stream(data), formats=FORMATS) as image:
-            kind, exif = image.format or "", image.info.get("exif")
+            kind = image.format or ""
+            turned = file.upright and image.getexif().get(ORIENTATION, 1) in TURNED
             if min(image.size) < LEAST_SIDE:
                 return Seen(
                     file.name,
                     f"{image.width} x {image.height} pixels: too small, features need {LEAST_SIDE} pixels a side",
                 )
+            if turned:
+                ImageOps.exif_transpose(image, in_place=True)
+            exif = image.info.get("exif")
             pixels = to_rgb(image, "it")
     except UnidentifiedImageError:
         return Seen(file.name, what_else(data))
     except Exception as error:  # Pillow's decoders raise whatever they meet
         return Seen(file.name, f"damaged or cut short ({reason(error)})")
-    as_it_is = kind in AS_THEY_ARE and conversion(data) in (None, "grayscale") and _is_8_bit(data)
+    as_it_is = not turned and kind in AS_THEY_ARE and conversion(data) in (None, "grayscale") and _is_8_bit(data)
     target = file.target.with_name(file.target.name + (AS_THEY_ARE[kind] if as_it_is else ".png"))
     if as_it_is:
         target.unlink(missing_ok=True)

@@ -2,6 +2,7 @@
 
 COLMAP's mapper often returns models that look healthy and are wrong. So settings are tried in a fixed order, all models
 of each try are looked at, cameras that cannot be are taken out where the rest is sound, and only a sound model is used.
+Of few photos a sound one can be inexact, so there two tries have to agree.
 """
 
 from __future__ import annotations
@@ -11,13 +12,15 @@ import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.colmap import import_pycolmap
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write
+from pipeline.ingest.agreement import differences, read_rotations
 from pipeline.scene import SceneError, check_model, depth_bounds
 
 # name, seed, options of the mapper
@@ -30,6 +33,9 @@ TRIES: tuple[tuple[str, int, dict[str, bool]], ...] = (
     ("seed-2", 2, {}),
 )
 ENOUGH = 0.95  # share of the photos that can be registered: no further try
+FEW = 50  # photos: up to so many, a second try has to agree
+SHARED = 0.5  # share of its photos that a model must have in common with one that it is compared with
+AGREE = 1.0  # degrees, the median over photos, within which two tries agree
 MOST_BAD = 0.25  # share of the cameras of a model that may be dropped for the rest to be believed
 LEAST_PHOTOS = 3
 STRONG = 30  # inliers of a pair: what the mapper needs to register a photo
@@ -54,6 +60,7 @@ class Try:
     """A try and the models that came out of it, the best first."""
 
     name: str
+    folder: Path
     models: list[Model]
 
     @property
@@ -68,44 +75,76 @@ class Try:
 
 def told(model: Model) -> str:
     """A model in words."""
-    bad = f", {len(model.bad)} bad cameras dropped" if model.bad and not model.unsound else ""
+    bad = (
+        f", {len(model.bad)} bad camera{'s' * (len(model.bad) > 1)} dropped" if model.bad and not model.unsound else ""
+    )
     return f"{len(model.photos)} photos{bad}, {model.unsound or f'sound, {model.points} points'}"
 
 
-def find_poses(
-    folder: Path, wanted: int, run: Callable[[int, Path], None], tries: tuple = TRIES
-) -> tuple[Try, Model, list[Try]]:
-    """Try settings until a sound model has nearly all of the `wanted` photos; returns the try that is used, its model
-    and all tries. Tries that are in `folder` already are read.
+class Found(NamedTuple):
+    """What is used of all tries."""
+
+    tried: Try
+    model: Model
+    tries: list[Try]
+    apart: dict[str, float]  # photo -> degrees from its pose in the try that agrees best; empty: there is no other
+
+    @property
+    def median(self) -> float:
+        """Degrees between the two tries; infinite where there is one alone."""
+        return median(self.apart.values()) if self.apart else float("inf")
+
+
+def find_poses(folder: Path, wanted: int, run: Callable[[int, Path], None], tries: tuple = TRIES) -> Found:
+    """Try settings until a sound model has nearly all of the `wanted` photos and, where these are few, a second one
+    agrees with it. Tries that are in `folder` already are read.
 
     Raises:
         CrossrayError: no try gave a sound model; the message tells each.
     """
     done: list[Try] = []
+    found = None
     for index, (name, _, _) in enumerate(tries):
         path = folder / f"{index}-{name}"
         if not (path / "verdict.json").exists():
             run(index, path)
         done.append(read_try(path))
-        best = done[-1].best
-        if best and len(best.photos) >= ENOUGH * wanted:
+        found = choose(done)
+        enough = found is not None and len(found.model.photos) >= ENOUGH * wanted
+        if found and enough and (len(found.model.photos) > FEW or found.median <= AGREE):
             break
-    sound = [t for t in done if t.best]
-    if not sound:
+    if found is None:
         lines = "".join(f"\n  {t.told()}" for t in done)
         raise CrossrayError(
             f"no sound model of the photos was found. Photos need to overlap and be taken from different places; more "
             f"of them help. Tried:{lines}"
         )
-    chosen = max(sound, key=lambda t: len(t.best.photos) if t.best else 0)
-    assert chosen.best is not None
-    return chosen, chosen.best, done
+    return found
+
+
+def choose(tries: list[Try]) -> Found | None:
+    """Of the sound models with nearly the most photos, the one that another try agrees with best; None: none is
+    sound.
+    """
+    sound = [(t, t.best) for t in tries if t.best]
+    if not sound:
+        return None
+    most = max(len(model.photos) for _, model in sound)
+    rotations = [read_rotations(t.folder / model.folder) for t, model in sound] if len(sound) > 1 else []
+    choices = []
+    for i, (tried, model) in enumerate(sound):
+        if len(model.photos) >= ENOUGH * most:
+            others = (differences(rotations[i], other) for j, other in enumerate(rotations) if j != i)
+            shared = (d for d in others if len(d) >= SHARED * len(model.photos))
+            apart = min(shared, key=lambda d: median(d.values()), default={})
+            choices.append(Found(tried, model, tries, apart))
+    return min(choices, key=lambda found: (found.median, -len(found.model.photos)))
 
 
 def read_try(folder: Path) -> Try:
     """A try that was completed."""
     record = json.loads((folder / "verdict.json").read_text())
-    return Try(record["name"], [Model(**m) for m in record["models"]])
+    return Try(record["name"], folder, [Model(**m) for m in record["models"]])
 
 
 def run_try(database: str, photos: str, folder: str, index: int) -> None:
@@ -125,7 +164,7 @@ def run_try(database: str, photos: str, folder: str, index: int) -> None:
     models = []
     for number, reconstruction in sorted(found.items()):
         kept = scratch / f"model-{number}"
-        models.append(judge(reconstruction, kept.name))
+        models.append(judge(reconstruction, kept.name, distortion=settings.get("ba_refine_extra_params", True)))
         kept.mkdir()
         reconstruction.write_binary(kept)
         shutil.rmtree(scratch / str(number), ignore_errors=True)
@@ -135,8 +174,12 @@ def run_try(database: str, photos: str, folder: str, index: int) -> None:
     scratch.rename(folder)
 
 
-def judge(model: Any, folder: str) -> Model:
-    """Take the cameras out of `model` (a `pycolmap.Reconstruction`) that cannot be, and say whether the rest can."""
+def judge(model: Any, folder: str, *, distortion: bool = True) -> Model:
+    """Take the cameras out of `model` (a `pycolmap.Reconstruction`) that cannot be, and say whether the rest can.
+
+    Args:
+        distortion: whether the lenses' distortion is adjusted, too, once cameras are out.
+    """
     before = [model.images[i].name for i in model.reg_image_ids()]
     bad: dict[str, str] = {}
     for _ in range(3):  # a point may have been seen by the bad cameras alone, a camera have seen such points alone
@@ -146,6 +189,8 @@ def judge(model: Any, folder: str) -> Model:
             model.deregister_frame(image.frame_id)
         if not found:
             break
+        if len(model.reg_image_ids()) >= LEAST_PHOTOS and model.points3D:
+            adjust(model, distortion)  # the bad ones had bent the others
     names = sorted(model.images[i].name for i in model.reg_image_ids())
     unsound = ""
     if len(bad) > MOST_BAD * len(before):
@@ -159,6 +204,14 @@ def judge(model: Any, folder: str) -> Model:
             unsound = str(wrong).partition(": reconstruct")[0]
     error = float(model.compute_mean_reprojection_error()) if model.points3D else 0.0
     return Model(folder, names, len(model.points3D), error, bad, unsound)
+
+
+def adjust(model: Any, distortion: bool) -> None:
+    """Bundle adjustment of all that is in `model`."""
+    pycolmap = import_pycolmap()
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_extra_params = distortion
+    pycolmap.bundle_adjustment(model, options)
 
 
 def bad_cameras(model: Any) -> dict[str, str]:

@@ -40,9 +40,9 @@ from pipeline.ingest import transforms
 from pipeline.ingest.child import in_child
 from pipeline.ingest.features import MATCHING, PAIRS, count_matched, find_features, inliers, make_database, match
 from pipeline.ingest.folder import Mapper, Seen, list_files, look_at
-from pipeline.ingest.mapping import TRIES, Model, Try, components, find_poses, read_try, run_try
+from pipeline.ingest.mapping import TRIES, Found, components, find_poses, read_try, run_try
 from pipeline.ingest.picture import draw_cameras
-from pipeline.ingest.summary import Summary, other_places, summarise
+from pipeline.ingest.summary import Summary, summarise
 from pipeline.ingest.undistort import undistort
 from pipeline.progress import Progress, shown
 from pipeline.scene import read_scene
@@ -78,8 +78,12 @@ def ingest(photos: Path, out: Path, *, mapper: Mapper, matching: str = "auto", t
     with claimed(out, identity) as work:
         if (out / f"{out.name}.tsv").exists() and (work / "summary.json").exists():
             log.info("%s is complete; nothing to do", out)
-            return Summary.read(work / "summary.json")
-        return _ingest(photos, files, posed, out, work, mapper, matching, test_every)
+            summary = Summary.read(work / "summary.json")
+        else:
+            summary = _ingest(photos, files, posed, out, work, mapper, matching, test_every)
+    if summary.inexact:
+        log.warning("%s: %s", out, summary.inexact)
+    return summary
 
 
 def identity_of(photos: Path, files: list[Path], matching: str, test_every: int) -> dict[str, Any]:
@@ -165,7 +169,7 @@ def _ingest(
     native = partial(in_child, log=work / "colmap.log")
     folder, database = work / "photos", work / "database.db"
     with timed(seconds, "looking"):
-        seen = look_once(work, photos if photos.is_dir() else photos.parent, files, folder, mapper)
+        seen = look_once(work, photos if photos.is_dir() else photos.parent, files, folder, mapper, upright=not posed)
     names = sorted(s.photo for s in seen if s.photo)
     rejected = len(seen) - len(names)
     log.info("%d photos%s", len(names), f"; {rejected} files rejected" if rejected else "")
@@ -179,21 +183,21 @@ def _ingest(
     pairs = inliers(database)
     with timed(seconds, "mapping"):
         if poses:
-            tried, chosen, tries = triangulated(work, database, folder, poses, native)
+            found = triangulated(work, database, folder, poses, native)
         else:
-            tried, chosen, tries = mapped(work, database, folder, names, pairs, native)
+            found = mapped(work, database, folder, names, pairs, native)
     with timed(seconds, "undistorting"):
         staging = work / "scene"
         if not (staging / "dense").exists():
-            native(undistort, str(work / "tries" / tried_folder(tries, tried) / chosen.folder), str(folder),
-                   str(staging / "dense"))  # fmt: skip
+            native(undistort, str(found.tried.folder / found.model.folder), str(folder), str(staging / "dense"))
         model = import_pycolmap().Reconstruction(str(staging / "dense" / "sparse"))
-    table = split_table(chosen.photos, out.name, test_every)
+    table = split_table(found.model.photos, out.name, test_every)
     atomic_write(staging / f"{out.name}.tsv", table)
     read_scene(staging)
-    others = other_places(tried, chosen)
-    summary = summarise(out, seen, model, chosen, others, pairs, tries, seconds)
-    draw_cameras(work / "cameras.png", model, f"{out.name}: {len(chosen.photos)} photos, {len(model.points3D)} points")
+    summary = summarise(out, seen, model, found, pairs, seconds)
+    draw_cameras(
+        work / "cameras.png", model, f"{out.name}: {len(found.model.photos)} photos, {len(model.points3D)} points"
+    )
     transforms.write_transforms(out, model, "dense/images")
     summary.write(work / "summary.json")
     shutil.rmtree(out / "dense", ignore_errors=True)
@@ -210,11 +214,11 @@ def timed(seconds: dict[str, float], step: str) -> Iterator[None]:
     seconds[step] = round(time.perf_counter() - began, 1)
 
 
-def look_once(work: Path, root: Path, files: list[Path], photos: Path, mapper: Mapper) -> list[Seen]:
+def look_once(work: Path, root: Path, files: list[Path], photos: Path, mapper: Mapper, *, upright: bool) -> list[Seen]:
     """What each file is, from files.json where that is there."""
     record = work / "files.json"
     if not record.exists():
-        seen = look_at(root, files, photos, shown(mapper, "looking at files"))
+        seen = look_at(root, files, photos, shown(mapper, "looking at files"), upright=upright)
         atomic_write(record, json.dumps([asdict(s) for s in seen], indent=1) + "\n")
     return [Seen(**{**s, "size": tuple(s["size"])}) for s in json.loads(record.read_text())]
 
@@ -237,7 +241,7 @@ def match_once(work: Path, database: Path, native: Callable[..., None]) -> None:
 
 def mapped(
     work: Path, database: Path, folder: Path, names: list[str], pairs: dict, native: Callable[..., None]
-) -> tuple[Try, Model, list[Try]]:
+) -> Found:
     """Poses by structure from motion."""
     groups = components(names, pairs)
 
@@ -249,9 +253,7 @@ def mapped(
     return find_poses(work / "tries", len(groups[0]) if groups else len(names), run)
 
 
-def triangulated(
-    work: Path, database: Path, folder: Path, poses: dict, native: Callable[..., None]
-) -> tuple[Try, Model, list[Try]]:
+def triangulated(work: Path, database: Path, folder: Path, poses: dict, native: Callable[..., None]) -> Found:
     """Points of photos whose poses are known."""
     path = work / "tries" / "0-triangulation"
     if not (path / "verdict.json").exists():
@@ -259,11 +261,7 @@ def triangulated(
     tried = read_try(path)
     if tried.best is None:
         raise CrossrayError(f"the poses and the photos do not agree: {tried.told()}")
-    return tried, tried.best, [tried]
-
-
-def tried_folder(tries: list[Try], tried: Try) -> str:
-    return f"{tries.index(tried)}-{tried.name}"
+    return Found(tried, tried.best, [tried], {})
 
 
 def known_cameras(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from rich.console import Group
@@ -12,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.ingest.folder import Seen
-from pipeline.ingest.mapping import Model, Try
+from pipeline.ingest.mapping import AGREE, Found, Model, Try
 from pipeline.log import plain
 
 LEAST_MATCHES = 15  # inliers: fewer of a pair do not count as overlap
@@ -33,6 +34,7 @@ class Summary:
     other_models: list[list[str]]  # files of photos that fell into another model
     tries: list[str]
     seconds: dict[str, float]  # of each step, as far as this run did it
+    apart: dict[str, float] = field(default_factory=dict)  # photo -> degrees between its poses in two tries
 
     def write(self, path: Path) -> None:
         """As JSON."""
@@ -45,6 +47,24 @@ class Summary:
         """What `write` wrote."""
         return cls(**json.loads(path.read_text()))
 
+    @property
+    def inexact(self) -> str:
+        """What to tell where two tries do not agree on the poses, or empty."""
+        if not self.apart or (middle := median(self.apart.values())) <= AGREE:
+            return ""
+        return (
+            f"the poses are not exact: two tries differ by {middle:.1f} degrees in the median, and a trained "
+            "scene would be blurred. More photos, larger ones, or more steps between standpoints help"
+        )
+
+    def agreement(self) -> str:
+        """How well a second try agrees, in words."""
+        if not self.apart:
+            return "not checked by a second try"
+        worst, most = max(self.apart.items(), key=lambda item: item[1])
+        middle = median(self.apart.values())
+        return f"two tries differ by {middle:.2f} degrees in the median, {most:.2f} at most ({self.registered[worst]})"
+
     def table(self) -> Group:
         """For a terminal."""
         focal = sorted(self.focal_lengths.values())
@@ -54,6 +74,7 @@ class Summary:
             ("points", f"{self.points}, each seen by {self.track_length:.1f} photos on average"),
             ("reprojection error", f"{self.reprojection_error:.2f} pixels"),
             ("focal lengths", f"{focal[0]:.2f} to {focal[-1]:.2f} of the longer side"),
+            ("poses", self.agreement()),
             ("tries", "\n".join(self.tries)),
             ("time", ", ".join(f"{step} {s:.0f} s" for step, s in self.seconds.items())),
         ):
@@ -104,14 +125,13 @@ def summarise(
     scene: Path,
     seen: list[Seen],
     model: Any,
-    chosen: Model,
-    others: list[Model],
+    found: Found,
     pairs: dict[tuple[str, str], int],
-    tries: list[Try],
     seconds: dict[str, float],
 ) -> Summary:
     """The summary of a scene whose undistorted model is `model` (a `pycolmap.Reconstruction`)."""
     files = {s.photo: s.name for s in seen if s.photo}
+    others = other_places(found.tried, found.model)
     focal = {}
     for image in (model.images[i] for i in model.reg_image_ids()):
         camera = model.cameras[image.camera_id]
@@ -119,12 +139,13 @@ def summarise(
     return Summary(
         scene=str(scene),
         registered={name: files[name] for name in sorted(focal)},
-        rejected=reasons(seen, chosen, others, pairs),
+        rejected=reasons(seen, found.model, others, pairs),
         points=len(model.points3D),
-        reprojection_error=chosen.error,
+        reprojection_error=found.model.error,
         track_length=float(model.compute_mean_track_length()),
         focal_lengths=dict(sorted(focal.items())),
         other_models=[sorted(files[n] for n in m.photos) for m in others],
-        tries=[t.told() for t in tries],
+        tries=[t.told() for t in found.tries],
         seconds=seconds,
+        apart={name: round(degrees, 3) for name, degrees in found.apart.items()},
     )

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.colmap import import_pycolmap
 from pipeline.errors import CrossrayError
-from pipeline.ingest.folder import list_files, look_at, safe_stems, what_else
+from pipeline.ingest.folder import File, list_files, look, look_at, safe_stems, what_else
 
 
 def picture(seed, size=(96, 80), mode="RGB"):
@@ -110,3 +111,23 @@ def test_no_folder_of_photos(tmp_path, make, message):
 
 def test_what_a_file_is():
     assert what_else(b"\0\0\0\x18ftypmp42") == "not a photo, or cut off at its start"
+
+
+def test_photos_are_turned_upright_and_keep_their_focal_length(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (80, 160, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the top of the photo is at its right
+    exif.get_ifd(0x8769)[0xA405] = 50  # mm, as of a 35 mm film of 43.3 mm across
+    Image.fromarray(pixels).save(tmp_path / "a.png", exif=exif)
+    (tmp_path / "out").mkdir()
+    turned = look(File(tmp_path / "a.png", "a.png", tmp_path / "out" / "turned"))
+    assert turned.size == (80, 160)
+    with Image.open(tmp_path / "out" / turned.photo) as image:
+        assert image.getexif().get(0x0112, 1) == 1
+        np.testing.assert_array_equal(np.asarray(image), np.rot90(pixels, -1))
+    stored = look(File(tmp_path / "a.png", "a.png", tmp_path / "out" / "stored", upright=False))
+    assert stored.size == (160, 80)
+    for photo in (turned.photo, stored.photo):
+        camera = import_pycolmap().infer_camera_from_image(tmp_path / "out" / photo)
+        assert camera.has_prior_focal_length
+        assert camera.focal_length_x == pytest.approx(50 / 43.27 * np.hypot(80, 160), rel=1e-3)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,14 @@ from plyfile import PlyData
 from pipeline.colmap import import_pycolmap
 from pipeline.errors import CrossrayError
 from pipeline.ingest import mapping
+from pipeline.ingest.agreement import differences, read_rotations
 from pipeline.ingest.child import NativeError, in_child
 from pipeline.ingest.features import all_pairs, nearest_pairs, next_pairs
 from pipeline.ingest.folder import Seen
 from pipeline.ingest.mapping import Model, Try, components, find_poses, judge
 from pipeline.ingest.picture import from_above
 from pipeline.ingest.run import claimed, split_table
-from pipeline.ingest.summary import other_places, reasons
+from pipeline.ingest.summary import Summary, other_places, reasons
 from pipeline.ingest.transforms import camera_of, read_transforms, write_ply
 from pipeline.ingest.undistort import looks_past, make_pinhole
 
@@ -77,41 +79,118 @@ def test_real_wrong_models_are_unsound_or_cleaned(test_data, name):
     assert verdict.unsound or verdict.bad
 
 
-def fake_run(models, seen):
-    def run(index, path):
-        seen.append(index)
-        path.mkdir(parents=True)
-        name = path.name.partition("-")[2]
-        (path / "verdict.json").write_text(json.dumps({"name": name, "models": models[index]}))
+def test_the_rest_is_adjusted_once_a_bad_camera_is_out(tmp_path):
+    model = model_of(tmp_path)
+    model.cameras[102].params = [1e6 * 48, 1e6 * 48, 24, 18]
+    wrong = model.images[model.reg_image_ids()[0]]
+    truth = wrong.cam_from_world().matrix()
+    wrong.frame.rig_from_world = import_pycolmap().Rigid3d(
+        wrong.cam_from_world().rotation, wrong.cam_from_world().translation + 0.02
+    )
+    before = model.compute_mean_reprojection_error()
+    judge(model, "m")
+    assert model.compute_mean_reprojection_error() < 0.2 * before
+    assert not np.array_equal(wrong.cam_from_world().matrix(), truth)  # its world may have moved with it
 
-    return run
+
+def test_differences_are_those_of_the_cameras_and_not_of_the_worlds(tmp_path):
+    pycolmap = import_pycolmap()
+    model = model_of(tmp_path)
+    (tmp_path / "a").mkdir(), (tmp_path / "b").mkdir()
+    model.write(tmp_path / "a")
+    model.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d([0.3, -0.2, 1.0]), [1.0, 2.0, 3.0]))
+    tilted = next(i for i in model.images.values() if i.name == "photo_003.jpg")
+    pose = tilted.cam_from_world()
+    tilted.frame.rig_from_world = pycolmap.Rigid3d(
+        pycolmap.Rotation3d([np.radians(7), 0, 0]) * pose.rotation, pose.translation
+    )
+    model.write(tmp_path / "b")
+    found = differences(read_rotations(tmp_path / "a"), read_rotations(tmp_path / "b"))
+    assert found.pop("photo_003.jpg") == pytest.approx(7, abs=1e-4)
+    assert list(found.values()) == pytest.approx([0] * 7, abs=1e-4)
+    two = dict(list(read_rotations(tmp_path / "a").items())[:2])
+    assert differences(two, read_rotations(tmp_path / "b")) == {}
 
 
-def fake(count, unsound=""):
-    return {"folder": "m", "photos": [f"{i}.jpg" for i in range(count)], "points": 9, "error": 0.5, "unsound": unsound}
+@pytest.fixture
+def fake_run(monkeypatch):
+    """Stands for the mapper: gives each try the models that a test names, which the names of their folders describe."""
+
+    def rotations(folder):
+        count, tilt = folder.name.split("-")
+        return {photo: turned(float(tilt) * i) for i, photo in enumerate(PHOTOS[: int(count)])}
+
+    monkeypatch.setattr(mapping, "read_rotations", rotations)
+
+    def make(models, seen):
+        def run(index, path):
+            seen.append(index)
+            path.mkdir(parents=True)
+            name = path.name.partition("-")[2]
+            (path / "verdict.json").write_text(json.dumps({"name": name, "models": models[index]}))
+
+        return run
+
+    return make
 
 
-def test_tries_end_with_the_first_that_has_nearly_all(tmp_path):
+PHOTOS = [f"{i}.jpg" for i in range(10)]
+
+
+def turned(degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def fake(count, unsound="", tilt=0.0):
+    return {"folder": f"{count}-{tilt}", "photos": PHOTOS[:count], "points": 9, "error": 0.5,
+            "unsound": unsound}  # fmt: skip
+
+
+def test_tries_end_when_a_second_one_agrees(tmp_path, fake_run):
     ran: list[int] = []
-    _, chosen, tries = find_poses(tmp_path, 10, fake_run([[fake(10, "collapsed")], [fake(4)], [fake(10)], []], ran))
-    assert ran == [0, 1, 2]
-    assert len(chosen.photos) == 10
+    models = [[fake(10, "collapsed")], [fake(4)], [fake(10, tilt=1.0)], [fake(10)], [fake(10, tilt=0.9)], []]
+    found = find_poses(tmp_path, 10, fake_run(models, ran))
+    assert ran == [0, 1, 2, 3, 4]  # the third and the fourth differ by 2.5 degrees in the median
+    assert found.tried.name == "fixed-distortion"
+    assert len(found.model.photos) == 10
+    assert found.median == pytest.approx(0.25)
     ran.clear()
-    assert find_poses(tmp_path, 10, fake_run([], ran))[2] == tries  # what is there is read
+    assert find_poses(tmp_path, 10, fake_run([], ran)).tries == found.tries  # what is there is read
     assert ran == []
 
 
-def test_the_largest_of_the_sound_ones_else_all_tries_are_told(tmp_path):
+def test_of_many_photos_one_try_suffices(tmp_path, fake_run, monkeypatch):
+    monkeypatch.setattr(mapping, "FEW", 9)
+    ran: list[int] = []
+    found = find_poses(tmp_path, 10, fake_run([[fake(10)]], ran))
+    assert (ran, found.apart) == ([0], {})
+
+
+def test_tries_that_never_agree_are_used_and_told(tmp_path, fake_run):
+    found = find_poses(tmp_path, 10, fake_run([[fake(10, tilt=2.0 * i)] for i in range(6)], []))
+    assert len(found.tries) == 6
+    assert found.median == pytest.approx(5)
+    same, focal = {p: p for p in PHOTOS}, dict.fromkeys(PHOTOS, 1.0)
+    summary = Summary("s", same, {}, 1, 0.1, 2.0, focal, [], [], {}, found.apart)
+    assert "two tries differ by 5.0 degrees in the median" in summary.inexact
+    exact = replace(summary, apart=dict.fromkeys(PHOTOS, 0.1))
+    assert exact.inexact == ""
+    assert exact.agreement() == "two tries differ by 0.10 degrees in the median, 0.10 at most (0.jpg)"
+    assert replace(summary, apart={}).agreement() == "not checked by a second try"
+
+
+def test_the_largest_of_the_sound_ones_else_all_tries_are_told(tmp_path, fake_run):
     results = [[fake(k)] for k in (3, 6, 4, 5, 3, 6)]
-    tried, chosen, _ = find_poses(tmp_path / "a", 10, fake_run(results, []))
-    assert (tried.name, len(chosen.photos)) == ("seed-1", 6)
+    found = find_poses(tmp_path / "a", 10, fake_run(results, []))
+    assert (found.tried.name, len(found.model.photos)) == ("seed-1", 6)
     with pytest.raises(
         CrossrayError, match=r"no sound model(.|\n)*default: 9 photos, collapsed(.|\n)*seed-2: no model"
     ):
         find_poses(tmp_path / "b", 10, fake_run([[fake(9, "collapsed")], [], [], [], [], []], []))
 
 
-def test_reasons():
+def test_reasons(tmp_path):
     seen = [Seen("A", photo="a"), Seen("B", "a PDF"), Seen("C", photo="c"), Seen("D", photo="d"), Seen("E", photo="e"),
             Seen("F", photo="f")]  # fmt: skip
     chosen = Model("m", ["a"], 1, 0.1, {"d": "focal 1e6"})
@@ -124,7 +203,7 @@ def test_reasons():
         "E": "registered in another model, of 3 photos",
         "F": "no pose found: 40 verified matches at most, with A",
     }
-    assert other_places(Try("t", [chosen, other]), chosen) == [other]
+    assert other_places(Try("t", tmp_path, [chosen, other]), chosen) == [other]
 
 
 def test_other_photos_begin_anew_until_the_scene_is_there(tmp_path):
