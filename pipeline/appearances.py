@@ -45,7 +45,7 @@ def find_appearance(model: SceneModel, photos: Photos, name: str) -> Read:
     """
     records = {record.name: index for index, record in enumerate(photos.records)}
     train = [photos.records[i].name for i in photos.indices("train")]
-    if model.embedding is not None and name not in train and (name in records or Path(name).is_file()):
+    if model.embedding is not None and name not in train and (name in records or is_file(name)):
         raise CrossrayError(
             f"{name}: model.appearance: embedding has learned the appearances of the training photos and reads no "
             f"other; name one of these, for example {train[0]!r}"
@@ -55,7 +55,7 @@ def find_appearance(model: SceneModel, photos: Photos, name: str) -> Read:
         picture, sha256 = photos.reference(index), photos.records[index].source_sha256
         if model.embedding is not None:
             return Read(training_appearance(model, photos, index), {"photo": name, "sha256": sha256})
-    elif Path(name).is_file():
+    elif is_file(name):
         picture, sha256 = read_picture(Path(name)), sha256_of(Path(name))
         picture = reduced(picture, photos.manifest.reference_downscale)
     else:
@@ -64,6 +64,14 @@ def find_appearance(model: SceneModel, photos: Photos, name: str) -> Read:
         raise CrossrayError(f"{name}: neither an image file nor the name of a photo of the scene{guess}")
     check_reference(model.spec, picture, name)
     return Read(read_appearance(model, picture), {"photo": Path(name).name, "sha256": sha256})
+
+
+def is_file(name: str) -> bool:
+    """Whether a file has this name; what no file could be called has none."""
+    try:
+        return Path(name).is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def read_picture(path: Path) -> np.ndarray:

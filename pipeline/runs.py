@@ -15,7 +15,8 @@ from pipeline.photos import Photos, open_photos
 
 
 def job_of(run: Path) -> Job:
-    """The job of a run's folder. A run that was moved is where it is now; its shards stay where they were.
+    """The job of a run's folder. A run that was moved is where it is now; its shards stay where they were, or have
+    moved with it.
 
     Raises:
         CrossrayError: no such run.
@@ -23,8 +24,19 @@ def job_of(run: Path) -> Job:
     if not (run / "job.yaml").is_file():
         raise CrossrayError(f"{run} is not a run: it has no job.yaml")
     job, folder = load_job(run / "job.yaml"), resolved(run)
-    scene = job.scene.model_copy(update={"shards": job.shards})
+    scene = job.scene.model_copy(update={"shards": shards_of(job, folder)})
     return job.model_copy(update={"runs": folder.parent, "name": folder.name, "scene": scene})
+
+
+def shards_of(job: Job, folder: Path) -> Path:
+    """The shards of the run in `folder`. Paths of a job are relative to where it was started: if there are no shards
+    as seen from here, they may be as seen from there, which the run's own path tells.
+    """
+    told = job.run.parts
+    if job.shards.is_absolute() or job.run.is_absolute() or job.shards.exists() or folder.parts[-len(told) :] != told:
+        return job.shards
+    seen_from_there = folder.parents[len(told) - 1] / job.shards
+    return seen_from_there if seen_from_there.exists() else job.shards
 
 
 def checkpoint_of(run: Path, step: int | None = None) -> Checkpoint:

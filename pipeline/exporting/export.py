@@ -32,7 +32,7 @@ from pipeline.config import nearest
 from pipeline.errors import CrossrayError
 from pipeline.exporting.cameras import colmap_text, exported_camera, transforms
 from pipeline.exporting.depth import preview, z_depth
-from pipeline.exporting.points import write_points
+from pipeline.exporting.points import check_budget, write_points
 from pipeline.exporting.readme import readme
 from pipeline.exporting.shown import Shown
 from pipeline.files import atomic_file, atomic_write, sha256_of
@@ -83,6 +83,9 @@ def export_run(
     painter = Painter(run, step)
     photos = painter.photos
     records = views_of(photos, view)
+    train = [photos.records[i] for i in photos.indices("train")]
+    if "points" in what:
+        check_budget(train, points)
     F, source = chosen_appearance(painter, appearance)
     about = {
         "checkpoint_sha256": painter.checkpoint.meta["sha256"][MODEL],
@@ -100,10 +103,11 @@ def export_run(
     if "views" in wanted or "depth" in wanted:
         write_views(out, shown, records, scale, [w for w in ("views", "depth") if w in wanted])
     if "points" in wanted and not (out / PLY).exists():
-        train = [photos.records[i] for i in photos.indices("train")]
         write_points(out / PLY, shown, train, scale, points, out / WORK)
     if "cameras" in wanted:
         write_cameras(out, records, scale, shown.pixel_center, wanted)
+        if "views" not in wanted:
+            log.info("the cameras' pictures, views/*.png, are not exported; --what cameras,views adds them")
     told = f"{painter.job.name} ({painter.job.method}, step {painter.checkpoint.step})"
     atomic_write(out / README, readme(told, source, wanted))
     record = {

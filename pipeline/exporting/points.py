@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from model.fields.base import Rays
+from pipeline.errors import CrossrayError
 from pipeline.exporting.shown import END, Shown
 from pipeline.files import atomic_file
 from pipeline.manifest import CameraRecord
@@ -74,6 +75,12 @@ def header(number: int) -> str:
     kinds = {"<f4": "float", "|u1": "uchar"}
     properties = "".join(f"property {kinds[VERTEX[n].str]} {n}\n" for n in VERTEX.names or ())
     return f"ply\nformat binary_little_endian 1.0\nelement vertex {number}\n{properties}end_header\n"
+
+
+def check_budget(cameras: Sequence[CameraRecord], budget: int) -> None:
+    """CrossrayError where so many rays give no point at all."""
+    if stride_for([(c.height, c.width) for c in cameras], budget)[1] == 0:
+        raise CrossrayError(f"--points {budget}: not one ray of each of {len(cameras)} training views; give more")
 
 
 def stride_for(sizes: Sequence[tuple[int, int]], budget: int) -> tuple[int, int]:

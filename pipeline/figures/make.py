@@ -177,6 +177,9 @@ def files_of(kind: str, out: Path) -> Files:
 
 def claim(files: Files, kind: str) -> None:
     """CrossrayError where one of the files is there and is not of a figure of this kind; one of them is made anew."""
+    folder = next(path for path in files.png.parents if path.exists())
+    if not folder.is_dir():
+        raise CrossrayError(f"--out: {folder} is a file; name a folder, or a PNG or PDF")
     there = next((path for path in files if path.exists()), None)
     if there is None:
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -414,6 +415,25 @@ def test_evaluations_after_training_wait_for_the_process_that_is_at_it(run, monk
 
 def test_a_moved_run_finds_its_own_checkpoints_and_shards(run, trained):
     assert load_run(run())[0].shards == trained / "shards" / "tiny"
+
+
+def test_shards_are_found_from_another_folder_than_the_one_where_a_run_was_started(tmp_path, monkeypatch):
+    start, elsewhere = tmp_path / "start", tmp_path / "elsewhere"
+    run = start / "out" / "runs" / "a"
+    for folder in (run, elsewhere, start / "out" / "shards"):
+        folder.mkdir(parents=True)
+    text = "kind: train\nname: a\nmethod: nerf\nscene: {path: s, shards: out/shards}\nruns: out/runs\n"
+    (run / "job.yaml").write_text(text)
+    monkeypatch.chdir(start)
+    assert job_of(Path("out/runs/a")).shards == Path("out/shards")
+    monkeypatch.chdir(elsewhere)
+    assert job_of(Path("../start/out/runs/a")).shards.resolve() == start / "out" / "shards"
+    (start / "out" / "shards").rmdir()
+    assert job_of(run).shards == Path("out/shards")  # nowhere: named as in the job
+    (elsewhere / "out" / "shards").mkdir(parents=True)
+    assert job_of(run).shards == Path("out/shards")
+    run.rename(elsewhere / "a")
+    assert job_of(elsewhere / "a").shards == Path("out/shards")
 
 
 def test_another_downscale_is_refused(run):

@@ -496,6 +496,8 @@ def test_wrong_input_is_one_message(trained, tmp_path):
         ({"view": "tset"}, "--view tset: no photo of the scene is of this split or name; there are train, val, test"),
         ({"view": "photo_01.jpg"}, "did you mean 'photo_0"),
         ({"appearance": "none.jpg"}, "none.jpg: neither an image file"),
+        ({"appearance": "n" * 300}, "nnn: neither an image file"),
+        ({"what": ["points"], "points": 1}, "--points 1: not one ray of each of"),
         ({"step": 7}, "no checkpoint of step 7"),
     ):
         with pytest.raises(CrossrayError, match=part):

@@ -418,6 +418,9 @@ def test_what_is_there_is_left_alone(run, tmp_path):
     with pytest.raises(CrossrayError, match=r"rays.pdf is there, and is no figure rays of ours"):
         make_figure("rays", run, tmp_path)
     assert (tmp_path / "rays.pdf").read_text() == "mine"
+    for out in (tmp_path / "rays.pdf" / "deep", tmp_path / "rays.pdf" / "f.png"):
+        with pytest.raises(CrossrayError, match=r"rays.pdf is a file; name a folder"):
+            make_figure("rays", run, out)
     files = make_figure("rays", run, tmp_path / "f.png", Order(columns=1))
     with pytest.raises(CrossrayError, match=r"f.png is there, and is no figure depth of ours"):
         make_figure("depth", run, tmp_path / "f.png")
