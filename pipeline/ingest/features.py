@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from pipeline.colmap import import_pycolmap
 from pipeline.errors import CrossrayError
@@ -75,16 +76,15 @@ def find_in_batch(batch: Batch) -> None:
 def make_database(
     path: Path, photos: Path, names: list[str], batches: list[Path], matching: str, known: dict[str, tuple] | None
 ) -> None:
-    """One database of all photos and their features, and beside it the pairs to match. A camera each, but photos whose
-    EXIF names the same camera, lens setting and size share one; `known` cameras (photo -> model, parameters) are as
-    they are.
+    """One database of all photos and their features, and beside it the pairs to match; `known` cameras (photo -> model,
+    parameters) are as they are.
     """
     pycolmap = import_pycolmap()
     scratch = path.with_name(f".{path.name}.tmp")
     scratch.unlink(missing_ok=True)
     pycolmap.Database.open(scratch).close()
-    mode = pycolmap.CameraMode.PER_IMAGE if known else pycolmap.CameraMode.AUTO
-    pycolmap.import_images(scratch, photos, camera_mode=mode, image_names=names)
+    mode = "PER_IMAGE" if known else who_shares(photos, names, matching)
+    pycolmap.import_images(scratch, photos, camera_mode=getattr(pycolmap.CameraMode, mode), image_names=names)
     database = pycolmap.Database.open(scratch)
     for image in database.read_all_images() if known else ():
         assert known is not None
@@ -109,6 +109,19 @@ def make_database(
     database.close()
     choose_pairs(scratch, matching, path.with_name(PAIRS))
     scratch.replace(path)
+
+
+def who_shares(photos: Path, names: list[str], matching: str) -> str:
+    """pycolmap's camera mode: a film's frames of one size have one camera; else photos share one whose EXIF names the
+    same camera, lens setting and size, and all others have their own.
+    """
+    if matching != "sequential":
+        return "AUTO"
+    sizes = set()
+    for name in names:
+        with Image.open(photos / name) as image:
+            sizes.add(image.size)
+    return "SINGLE" if len(sizes) == 1 else "AUTO"
 
 
 def choose_pairs(database: Path, matching: str, pairs_file: Path) -> int:

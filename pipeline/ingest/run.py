@@ -58,8 +58,9 @@ def ingest(photos: Path, out: Path, *, mapper: Mapper, matching: str = "auto", t
 
     Args:
         mapper: runs the tasks (`pipeline.launch.tasks`): looking at files, finding features.
-        matching: which pairs of photos are compared: exhaustive (all), sequential (next in name order), nearest (most
-            alike), or auto: all up to 200 photos, above that sequential and nearest together.
+        matching: which pairs of photos are compared: exhaustive (all), sequential (next in name order; if all have one
+            size they share a camera, as a film's frames do), nearest (most alike), or auto: all up to 200 photos, above
+            that the next and the nearest together.
         test_every: every so many photos in name order, the first of all included, one is for testing; 0: none.
 
     Raises:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from plyfile import PlyData
 
 from pipeline.colmap import import_pycolmap
@@ -20,7 +21,7 @@ from pipeline.errors import CrossrayError
 from pipeline.ingest import mapping
 from pipeline.ingest.agreement import differences, read_rotations
 from pipeline.ingest.child import NativeError, in_child
-from pipeline.ingest.features import all_pairs, nearest_pairs, next_pairs
+from pipeline.ingest.features import all_pairs, nearest_pairs, next_pairs, who_shares
 from pipeline.ingest.folder import Seen
 from pipeline.ingest.mapping import Model, Try, components, find_poses, judge
 from pipeline.ingest.picture import from_above
@@ -346,3 +347,11 @@ def running(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def test_frames_of_a_film_share_a_camera(tmp_path):
+    for name, size in (("a.png", (8, 6)), ("b.png", (8, 6)), ("c.png", (6, 8))):
+        Image.new("RGB", size).save(tmp_path / name)
+    assert who_shares(tmp_path, ["a.png", "b.png"], "sequential") == "SINGLE"
+    assert who_shares(tmp_path, ["a.png", "b.png"], "auto") == "AUTO"
+    assert who_shares(tmp_path, ["a.png", "b.png", "c.png"], "sequential") == "AUTO"
