@@ -41,8 +41,10 @@ class PathTab:
         self._name = gui.add_text("Name", "path")
         save = gui.add_button("Save path")
         self._said = gui.add_html("")
+        remove = gui.add_button("Remove the last", color="gray")
         clear = gui.add_button("Clear", color="gray")
         add.on_click(told(client, self._add))
+        remove.on_click(told(client, self._remove))
         clear.on_click(told(client, self._clear))
         save.on_click(told(client, self._save))
         self._show()
@@ -52,6 +54,11 @@ class PathTab:
             if len(self.keys) >= MOST_KEYS:
                 raise CrossrayError(f"a path of more than {MOST_KEYS} key views; save this one, and begin another")
             self.keys.append(self._here())
+            self._show()
+
+    def _remove(self) -> None:
+        with self._lock:
+            del self.keys[-1:]
             self._show()
 
     def _clear(self) -> None:

@@ -2,7 +2,8 @@
 photo.
 
 The loop's every centre and every point that it looks at is a convex combination of those of the training cameras, with
-most of the weight on cameras nearby: so it lies within their hull, and looks as the cameras around it look.
+most of the weight on cameras nearby: so it lies within their hull, and looks as the cameras around it look. Between few
+cameras that stand apart nothing can be learned: there it is a flight through those that stand together, and back.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -28,6 +31,9 @@ BAND = math.radians(12)  # of angles over which cameras are averaged, at most
 TAILS = (5, 95)  # percentiles of the cameras' angles between which an open loop stays
 ASPECT = 3 / 2
 DENSE = 512  # points in which a loop is laid out
+TOGETHER = 0.45  # between two cameras that stand together, of the distance to what they look at: some 25 degrees
+LINKS = 16  # nearest cameras that a camera may stand together with
+ALIKE = math.radians(30)  # between their viewing directions
 SMOOTHING = 0.02  # of a loop's length: sigma of the filter that rounds its corners
 
 
@@ -44,7 +50,8 @@ def bounds_at(cameras: Sequence[Camera], centres: np.ndarray) -> tuple[float, fl
 
 def orbit(cameras: Sequence[Camera], frames: int, size: tuple[int, int] | None = None) -> list[Camera]:
     """A closed loop through training cameras: around what they look at where they surround it, else along them and
-    back; it starts and ends without a jump.
+    back; it starts and ends without a jump. Where fewer than half of the cameras are linked by others that stand
+    together, it is a flight through the largest such group (`together`), which shows no more than its photos do.
 
     The field of view across the shorter side follows that of the cameras around: a wide picture then shows no more
     above and below than their photos do. Depth bounds are `bounds_at`. Memory: a few DENSE x len(cameras) float64.
@@ -62,6 +69,10 @@ def orbit(cameras: Sequence[Camera], frames: int, size: tuple[int, int] | None =
     up = up_of(poses)
     typical = median_distance(cameras)
     targets, angles = looked_at(poses, up, typical)
+    group = together(poses, targets)
+    if 1 < len(group) < len(cameras) / 2:
+        there = [cameras[i] for i in sorted(group, key=lambda i: angles[i])]
+        return there_and_back(there, frames, centred(cameras, size))
     route, is_closed = angle_route(angles)
     focal = np.log([[math.sqrt(c.fx * c.fy) / min(c.width, c.height)] for c in cameras])
     rows = laid_out(np.hstack([poses[:, :, 3], targets, focal]), angles, route, is_closed, typical)
@@ -139,6 +150,33 @@ def looked_at(poses: np.ndarray, up: np.ndarray, distance: float) -> tuple[np.nd
     ahead = looking(unit(median_of(forwards), forwards[0]), up)[:, 0]  # horizontal: angle zero is across the main view
     side = np.cross(up, ahead)
     return targets, np.arctan2(outwards @ side, outwards @ ahead)
+
+
+def together(poses: np.ndarray, targets: np.ndarray) -> list[int]:
+    """The largest group of cameras (N, 3, 4) that stand together, each with one other of it at least; of several of a
+    size the widest, which shows most.
+    """
+    centres, forwards = poses[:, :, 3], poses[:, :, 2]
+    depth = np.linalg.norm(targets - centres, axis=1)
+    apart, j = cKDTree(centres).query(centres, k=range(1, min(LINKS, len(poses)) + 1))
+    i = np.broadcast_to(np.arange(len(poses))[:, None], j.shape)
+    joined = apart <= TOGETHER * np.minimum(depth[i], depth[j])
+    joined &= (forwards[i] * forwards[j]).sum(-1) > math.cos(ALIKE)
+    links = coo_matrix((np.ones(joined.sum()), (i[joined], j[joined])), shape=(len(poses), len(poses)))
+    _, label = connected_components(links, directed=False)
+    groups = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
+    return max(groups, key=lambda g: (len(g), float(np.ptp(centres[g], axis=0).max()))).tolist()
+
+
+def there_and_back(stops: Sequence[Camera], frames: int, lens: Camera) -> list[Camera]:
+    """A flight through cameras and back, in pictures of the size of `lens` that show no more than the photos do, but
+    for their principal points.
+    """
+    cropped = []
+    for stop in stops:
+        f = max(stop.fx * lens.width / stop.width, stop.fy * lens.height / stop.height)
+        cropped.append(posed(replace(lens, fx=f, fy=f, near=stop.near, far=stop.far), stop.pose))
+    return between([*cropped, *cropped[-2::-1]], frames)
 
 
 def angle_route(angles: np.ndarray) -> tuple[np.ndarray, bool]:

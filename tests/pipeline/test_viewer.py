@@ -742,6 +742,9 @@ def test_a_path_is_recorded(served, look):
     last, photo = film.frames[-1].camera.pose, cameras["photo_005.jpg"].pose
     np.testing.assert_allclose(last[:, 3], photo[:, 3], atol=1e-4)  # where it was taken
     assert last[:, 2] @ photo[:, 2] > 0.9999
+    page.get_by_role("button", name="Remove the last").click()
+    until_true(page, lambda: page.locator(".crossray-keys li").count() == 1)
+    assert len(panel.path.keys) == 1
     page.get_by_role("button", name="Clear").click()
     page.get_by_text("no key view yet", exact=True).wait_for()
 
