@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from pipeline.manifest import CameraRecord
 from pipeline.views.camera import Camera, camera_of
 from pipeline.views.geometry import up_of
+from pipeline.views.smooth import bounds_at
 
-NEAREST = 3  # training cameras whose bounds a view takes
 SMALLEST_ANGLE, LARGEST_ANGLE = 0.01, 3.1  # radians of a browser's field of view that are drawn
 
 
@@ -25,6 +25,7 @@ class Place:
             box: (2, 3), the corners of what was seen.
         """
         self.records = tuple(records)
+        self.cameras = [camera_of(record) for record in records]
         poses = np.array([record.c2w for record in records])
         self.positions, self.forward = poses[:, :, 3], poses[:, :, 2]
         self.centre = np.asarray(box, np.float64).mean(axis=0)
@@ -36,12 +37,6 @@ class Place:
         distance = np.linalg.norm(self.positions - np.median(self.positions, axis=0), axis=1)
         turned = 1 - self.forward @ self.forward.mean(axis=0)
         return self.records[int(np.argmin(distance / max(distance.mean(), 1e-9) + turned))]
-
-    def bounds(self, position: np.ndarray) -> tuple[float, float]:
-        """Depths z within which the scene lies for a camera at `position`: those of the NEAREST training cameras."""
-        order = np.argsort(np.linalg.norm(self.positions - position, axis=1))[:NEAREST]
-        chosen = [self.records[i] for i in order]
-        return min(r.near for r in chosen), max(r.far for r in chosen)
 
     def look_at(self, record: CameraRecord) -> np.ndarray:
         """(3,) A point in the middle of a camera's view, about as far away as the scene's centre is."""
@@ -70,7 +65,7 @@ class Place:
         w, x, y, z = wxyz
         pose = np.column_stack([Rotation.from_quat([x, y, z, w]).as_matrix(), position])
         rows = [(float(a), float(b), float(c), float(d)) for a, b, c, d in pose]
-        near, far = self.bounds(position)
+        ((near, far),) = bounds_at(self.cameras, position[None]).tolist()
         return Camera(width, height, focal, focal, width / 2, height / 2, (rows[0], rows[1], rows[2]), near, far)
 
 

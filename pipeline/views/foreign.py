@@ -130,10 +130,10 @@ def assembled(
     """The path of what was read, one entry a frame: lenses are fx, fy, cx, cy in pixels, poses (3, 4) in scene units;
     depth bounds are those of training cameras nearby.
     """
-    near, far = bounds_at(list(train), np.array(poses)[:, :, 3])
+    bounds = bounds_at(list(train), np.array(poses)[:, :, 3]).tolist()
     frames = [
         Frame(posed(Camera(*size, *lens, ORIGIN, near, far), pose), w)
-        for lens, pose, w in zip(lenses, poses, weights, strict=True)
+        for lens, (near, far), pose, w in zip(lenses, bounds, poses, weights, strict=True)
     ]
     return CameraPath(tuple(frames), fps, tuple(appearances))
 

@@ -349,10 +349,10 @@ def test_a_photo_s_place(trained):
     record = photos.records[0]
     place = Place([record], np.array(photos.manifest.scene.box))
     assert place.start is record
-    assert place.bounds(np.zeros(3)) == (record.near, record.far)
     pose = np.array(record.c2w)
     camera = place.camera(quaternion(record), pose[:, 3], angle_of(record, 4 / 3), (record.width, record.height), 999)
     np.testing.assert_allclose(camera.pose, pose, atol=1e-9)
+    assert (camera.near, camera.far) == pytest.approx((record.near, record.far))
     assert camera.fy == pytest.approx(record.fy)  # of its own aspect: its own field of view
     assert tan(angle_of(record, 0.5) / 2) == pytest.approx(
         record.width / 2 / record.fx / 0.5
@@ -370,7 +370,10 @@ def test_bounds_are_those_of_the_nearest(trained):
         for x in range(10)
     ]
     place = Place(records, np.zeros((2, 3)))
-    assert place.bounds(np.array([8.9, 0, 0])) == (8.0, 19.0)  # of 7, 8 and 9
+    there = place.camera(np.array([1.0, 0, 0, 0]), np.array([8.0, 0, 0]), 1.0, (8, 8), 8)
+    assert (there.near, there.far) == pytest.approx((9.0, 18.0))  # its own
+    beside = place.camera(np.array([1.0, 0, 0, 0]), np.array([7.5, 0, 0]), 1.0, (8, 8), 8)
+    assert 8 < beside.near < 9
     assert place.start.near in (5.0, 6.0)
 
 

@@ -23,7 +23,7 @@ from pipeline.views.choose import Stills, read_path, readings, stops_of, views_o
 from pipeline.views.geometry import focus_of, looking, up_of, weighted_median
 from pipeline.views.nerfstudio import read_camera_path, write_camera_path
 from pipeline.views.path import CameraPath, Frame, path_of
-from pipeline.views.smooth import between, bounds_at, orbit
+from pipeline.views.smooth import between, bounds_at, orbit, there_and_back
 from pipeline.views.trajectory import read_trajectory, write_trajectory
 
 UP = np.array([0.0, -1.0, 0.0])  # the world of these tests is like a level camera's: y down
@@ -314,12 +314,64 @@ def test_orbit_refuses():
         orbit([LENS], 3, (0, 5))
 
 
+def slow_bounds(cameras, centre):
+    """Means of logarithms, by Franke and Little's weights: the nine nearest cameras, one by one."""
+    distances = sorted((float(np.linalg.norm(c.pose[:, 3] - centre)), i) for i, c in enumerate(cameras))
+    end = distances[8][0]
+    weights = [((end - d) / (end * d)) ** 2 for d, _ in distances[:8]]
+    logs = [(math.log(cameras[i].near), math.log(cameras[i].far)) for _, i in distances[:8]]
+    return [math.exp(sum(w * n[k] for w, n in zip(weights, logs, strict=True)) / sum(weights)) for k in (0, 1)]
+
+
 def test_bounds_are_those_of_the_nearest_cameras():
     cameras = [replace(camera_at((x, 0, 0), (x, 0, 1)), near=1 + x, far=10 + x) for x in range(20)]
-    assert bounds_at(cameras, np.array([[0.0, 0, 0]])) == (1, 17)  # 0 to 7
-    assert bounds_at(cameras, np.array([[0.0, 0, 0], [19.0, 0, 0]])) == (1, 29)
-    assert bounds_at(cameras[:2], np.array([[9.0, 0, 0]])) == (1, 11)
-    assert bounds_at(cameras[:1], np.array([[9.0, 0, 0]])) == (1, 10)
+    places = np.array([(x, 0.1, 0.2) for x in np.linspace(-1.3, 21.7, 24)])
+    np.testing.assert_allclose(bounds_at(cameras, places), [slow_bounds(cameras, p) for p in places], rtol=1e-5)
+    standing = np.array([c.pose[:, 3] for c in cameras])
+    np.testing.assert_allclose(bounds_at(cameras, standing)[3], (4, 13), rtol=1e-6)  # where a camera is: its own
+    np.testing.assert_allclose(bounds_at(cameras[:2], np.array([[0.5, 0, 0]])), [(math.sqrt(2), math.sqrt(110))])
+    np.testing.assert_allclose(bounds_at(cameras[:1], np.array([[9.0, 0, 0], [0.0, 0, 0]])), [(1, 10)] * 2)
+    np.testing.assert_allclose(bounds_at([cameras[0]] * 20, np.zeros((1, 3))), [(1, 10)])
+
+
+def test_bounds_change_smoothly():
+    rng = np.random.default_rng(0)
+    cameras = [
+        replace(camera_at(rng.uniform(-1, 1, 3), (0, 0, 9)), near=rng.uniform(0.1, 1), far=rng.uniform(2, 9))
+        for _ in range(40)
+    ]
+    way = np.linspace(-1, 1, 4000)[:, None] * np.array([0.7, 0.5, -0.6])
+    steps = np.abs(np.diff(np.log(bounds_at(cameras, way)), axis=0))
+    assert steps.max() < 0.02  # no jump where one camera takes another's place among the nearest
+
+
+def test_orbit_of_few_cameras_apart_is_a_flight_among_those_together():
+    """Eight photos, placed as the training photos of a real small collection: three beside the place, two before it,
+    three from afar by telephoto."""
+    target = (-0.1, 0.3, 2.0)
+    beside = [camera_at(c, target) for c in ((-0.79, 0.47, 1.48), (-0.89, 0.33, 1.2), (-0.85, 0.34, 1.23))]
+    before = [camera_at(c, target) for c in ((-0.35, 0.4, 1.41), (-0.17, 0.24, 0.9))]
+    tele = replace(LENS, fx=150.0, fy=150.0, near=2.3, far=4.7)
+    afar = [camera_at(c, target, tele) for c in ((0.63, -0.45, -1.65), (0.74, -0.47, -1.67), (0.74, -0.45, -1.64))]
+    frames = orbit([*afar, *before, *beside], 40)
+    assert_usable(frames)
+    assert len(frames) == 40
+    p = poses_of(frames)[:, :, 3]
+    ends = poses_of(beside)[:, :, 3]
+    assert (p >= ends.min(0) - 1e-9).all()
+    assert (p <= ends.max(0) + 1e-9).all()
+    assert np.ptp(p, axis=0) == pytest.approx(np.ptp(ends, axis=0), rel=0.05)  # past all of them
+    np.testing.assert_allclose(p[0], p[-1])
+    assert {f.near for f in frames} == {LENS.near}  # none of the telephotos'
+
+
+def test_a_flight_shows_no_more_than_its_photos():
+    portrait = replace(LENS, width=32, height=48, cx=16.0, cy=24.0)
+    cameras = [camera_at((0.1 * i, 0, -4), (0, 0, 0), portrait) for i in range(2)]
+    frames = there_and_back(cameras, 5, replace(LENS, width=48, height=32, cx=24.0, cy=16.0))
+    for frame in frames:
+        assert frame.width / frame.fx <= portrait.width / portrait.fx + 1e-9
+        assert frame.height / frame.fy <= portrait.height / portrait.fy + 1e-9
 
 
 # ------------------------------------------------------------------------------------------------------- flights
@@ -460,7 +512,7 @@ def test_nerfstudio_file_by_hand(file):
     lens = first.camera
     assert (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy) == pytest.approx((200, 100, 50, 50, 100, 50))
     assert second.camera.fy == pytest.approx(50 * math.sqrt(3))  # 50 / tan 30
-    assert (lens.near, lens.far) == (0.5, 12)
+    assert [[lens.near, lens.far]] == bounds_at(list(TRAIN.values()), np.array([AS_OPENCV])[:, :, 3]).tolist()
     assert (path.fps, path.appearances) == (24, ("photo 0.jpg", "/tmp/evening.jpg"))
     assert first.weights == (0.25, 0.75)
     assert second.weights is None
