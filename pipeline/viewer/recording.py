@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_write, resolved
@@ -79,8 +78,7 @@ def film_of(keys: Sequence[Key], seconds: float, names: dict[Light, str]) -> Cam
     else:
         frames = round(seconds * (len(keys) - 1) * FPS) + 1
         cameras = between([key.camera for key in keys], frames)
-        poses = np.array([key.camera.pose for key in keys])
-        times = travel_times(poses[:, :, 3], Rotation.from_matrix(poses[:, :, :3]))
+        times = travel_times([key.camera for key in keys])
         share = np.arange(frames) / max(frames - 1, 1)
         moments = times[-1] * share * share * (3 - 2 * share)  # as the cameras ease in and out
     if not names:

@@ -30,6 +30,7 @@ GAP = math.radians(60)  # between neighbours around the focus: a wider one is no
 BAND = math.radians(12)  # of angles over which cameras are averaged, at most
 TAILS = (5, 95)  # percentiles of the cameras' angles between which an open loop stays
 ASPECT = 3 / 2
+ZOOM = 0.5  # radians by which the edge of a usual picture moves when it grows e-fold
 DENSE = 512  # points in which a loop is laid out
 AWAY, LOST = 0.3, 0.25
 TOGETHER = 0.45  # between two cameras that stand together, of the distance to what they look at: some 25 degrees
@@ -117,7 +118,7 @@ def between(stops: Sequence[Camera], frames: int) -> list[Camera]:
     rotations = Rotation.from_matrix(poses[:, :, :3])
     lengths = np.log([(stop.fx, stop.fy, stop.near, stop.far) for stop in stops])
     values = np.hstack([poses[:, :, 3], lengths, [(stop.cx, stop.cy) for stop in stops]])
-    times = travel_times(poses[:, :, 3], rotations)
+    times = travel_times(stops)
     share = np.arange(frames) / max(frames - 1, 1)
     moments = times[-1] * share * share * (3 - 2 * share)
     found = PchipInterpolator(times, values)(moments)
@@ -185,13 +186,14 @@ def together(poses: np.ndarray, targets: np.ndarray) -> list[int]:
 
 def there_and_back(stops: Sequence[Camera], frames: int, lens: Camera) -> list[Camera]:
     """A flight through cameras and back, in pictures of the size of `lens` that show no more than the photos do, but
-    for their principal points.
+    for their principal points; slow at both ends.
     """
     cropped = []
     for stop in stops:
         f = max(stop.fx * lens.width / stop.width, stop.fy * lens.height / stop.height)
         cropped.append(posed(replace(lens, fx=f, fy=f, near=stop.near, far=stop.far), stop.pose))
-    return between([*cropped, *cropped[-2::-1]], frames)
+    there = between(cropped, frames // 2 + 1)
+    return [*there, *there[-2::-1]][:frames]
 
 
 def angle_route(angles: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -264,12 +266,16 @@ def even_pixels(length: float) -> int:
     return max(2, round(length / 2) * 2)
 
 
-def travel_times(centres: np.ndarray, rotations: Rotation) -> np.ndarray:
+def travel_times(stops: Sequence[Camera]) -> np.ndarray:
     """When a flight passes each of its stops (N,), from 0 on, so that it is about equally fast throughout: a way as
-    long as the average one takes as much as the average turn. Every leg takes some time, also one that leads nowhere.
+    long as the average one takes as much as the average turn, and a zoom as much as the turn that moves a picture's
+    edge as far. Every leg takes some time, also one that leads nowhere.
     """
-    ways = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    turns = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    poses = np.array([stop.pose for stop in stops])
+    rotations = Rotation.from_matrix(poses[:, :, :3])
+    zoom = np.log([stop.fx / stop.width * stop.fy / stop.height for stop in stops]) / 2
+    ways = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1)
+    turns = (rotations[:-1].inv() * rotations[1:]).magnitude() + ZOOM * np.abs(np.diff(zoom))
     legs = ways / max(ways.mean(), 1e-9) + turns / max(turns.mean(), 1e-9)
     return np.concatenate([[0], np.cumsum(legs + 1e-2)])
 

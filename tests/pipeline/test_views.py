@@ -23,7 +23,7 @@ from pipeline.views.choose import Stills, read_path, readings, stops_of, views_o
 from pipeline.views.geometry import focus_of, looking, up_of, weighted_median
 from pipeline.views.nerfstudio import read_camera_path, write_camera_path
 from pipeline.views.path import CameraPath, Frame, path_of
-from pipeline.views.smooth import between, bounds_at, orbit, there_and_back
+from pipeline.views.smooth import between, bounds_at, orbit, there_and_back, travel_times
 from pipeline.views.trajectory import read_trajectory, write_trajectory
 
 UP = np.array([0.0, -1.0, 0.0])  # the world of these tests is like a level camera's: y down
@@ -361,8 +361,19 @@ def test_orbit_of_few_cameras_apart_is_a_flight_among_those_together():
     assert (p >= ends.min(0) - 1e-9).all()
     assert (p <= ends.max(0) + 1e-9).all()
     assert np.ptp(p, axis=0) == pytest.approx(np.ptp(ends, axis=0), rel=0.05)  # past all of them
-    np.testing.assert_allclose(p[0], p[-1])
+    np.testing.assert_allclose(p[1:20], p[:20:-1])  # there and back, without the first frame twice
+    moved = jumps(frames)[0]
+    assert max(moved[0], moved[19], moved[20]) < 0.3 * moved.max()  # slow where it turns
     assert {f.near for f in frames} == {LENS.near}  # none of the telephotos'
+
+
+def test_a_zoom_takes_its_time():
+    stops = ring([0, 30, 30])
+    zoomed = [*stops[:2], replace(stops[2], fx=160.0, fy=160.0)]
+    plain, slower = travel_times(stops), travel_times(zoomed)
+    assert plain[2] - plain[1] == pytest.approx(1e-2)
+    turn, zoom = math.radians(30), 0.5 * math.log(4)
+    assert slower[2] - slower[1] == pytest.approx(zoom / ((turn + zoom) / 2) + 1e-2)
 
 
 def test_a_flight_shows_no_more_than_its_photos():
