@@ -26,7 +26,7 @@ Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 LEAST_SIDE = 64  # pixels: below, SIFT's largest scales do not fit and no camera is found
 LEAST_PHOTOS = 3
 AS_THEY_ARE = {"JPEG": ".jpg", "PNG": ".png"}
-ORIENTATION, TURNED = 0x0112, range(2, 9)  # EXIF: 1 is upright
+ORIENTATION = 0x0112  # EXIF: 1 is upright, 2 to 8 are turned or mirrored
 HEIC = (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
 
 
@@ -133,16 +133,14 @@ def look(file: File) -> Seen:
     try:
         with Image.open(_stream(data), formats=FORMATS) as image:
             kind = image.format or ""
-            turned = file.upright and image.getexif().get(ORIENTATION, 1) in TURNED
+            photo = upright(image) if file.upright else image
             if min(image.size) < LEAST_SIDE:
                 return Seen(
                     file.name,
                     f"{image.width} x {image.height} pixels: too small, features need {LEAST_SIDE} pixels a side",
                 )
-            if turned:
-                ImageOps.exif_transpose(image, in_place=True)
-            exif = image.info.get("exif")
-            pixels = to_rgb(image, "it")
+            exif, turned = photo.info.get("exif"), photo is not image
+            pixels = to_rgb(photo, "it")
     except UnidentifiedImageError:
         return Seen(file.name, what_else(data))
     except Exception as error:  # Pillow's decoders raise whatever they meet
@@ -157,6 +155,15 @@ def look(file: File) -> Seen:
             Image.fromarray(pixels).save(stream, "PNG", compress_level=1, **({"exif": exif} if exif else {}))
     digest = hashlib.sha256(repr(pixels.shape).encode() + np.ascontiguousarray(pixels).tobytes()).hexdigest()
     return Seen(file.name, photo=target.name, size=(pixels.shape[1], pixels.shape[0]), pixels_sha256=digest)
+
+
+def upright(image: Image.Image) -> Image.Image:
+    """The photo turned as its EXIF orientation says; the image itself where that says nothing, or nonsense."""
+    try:
+        turned = image.getexif().get(ORIENTATION, 1) in range(2, 9)
+        return ImageOps.exif_transpose(image) if turned else image
+    except Exception:  # Pillow's EXIF reader raises whatever it meets; damaged pixels are told where they are read
+        return image
 
 
 def what_else(data: bytes) -> str:

@@ -131,3 +131,9 @@ def test_photos_are_turned_upright_and_keep_their_focal_length(tmp_path):
         camera = import_pycolmap().infer_camera_from_image(tmp_path / "out" / photo)
         assert camera.has_prior_focal_length
         assert camera.focal_length_x == pytest.approx(50 / 43.27 * np.hypot(80, 160), rel=1e-3)
+
+
+def test_a_photo_with_damaged_exif_is_a_photo(tmp_path):
+    Image.new("RGB", (80, 70), "red").save(tmp_path / "a.jpg", exif=b"Exif\x00\x00garbage")
+    seen = look(File(tmp_path / "a.jpg", "a.jpg", tmp_path / "out"))
+    assert (seen.reason, seen.size) == ("", (80, 70))
