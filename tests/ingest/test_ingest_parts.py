@@ -319,10 +319,11 @@ def test_how_a_child_ends(tmp_path):
 def test_an_interrupted_parent_leaves_no_child(tmp_path, number):
     script = tmp_path / "parent.py"
     script.write_text(
-        "import time, os, sys\nfrom pathlib import Path\n"
+        "import os, signal, time\nfrom pathlib import Path\n"
         "def work(file):\n    Path(file).write_text(str(os.getpid()))\n    time.sleep(600)\n"
         "if __name__ == '__main__':\n"
         "    from pipeline.ingest.child import in_child\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background jobs ignore it
         f"    in_child(work, {str(tmp_path / 'pid')!r}, log=Path({str(tmp_path / 'log')!r}))\n"
     )
     file = tmp_path / "pid"
@@ -331,7 +332,7 @@ def test_an_interrupted_parent_leaves_no_child(tmp_path, number):
     wait_until(lambda: file.exists() and file.read_text() != "")
     child = int(file.read_text())
     parent.send_signal(number)
-    assert parent.wait(10) != 0
+    assert parent.wait(30) != 0
     wait_until(lambda: not running(child))
 
 
