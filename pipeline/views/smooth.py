@@ -32,7 +32,8 @@ TAILS = (5, 95)  # percentiles of the cameras' angles between which an open loop
 ASPECT = 3 / 2
 ZOOM = 0.5  # radians by which the edge of a usual picture moves when it grows e-fold
 DENSE = 512  # points in which a loop is laid out
-AWAY, LOST = 0.3, 0.25
+AWAY = 0.3  # from all cameras, of the distance to what the nearest one looks at: some 17 degrees
+LOST = 0.25  # share of a loop that may be away: of photos that surround a place, up to 45 degrees apart, less is
 TOGETHER = 0.45  # between two cameras that stand together, of the distance to what they look at: some 25 degrees
 LINKS = 16  # nearest cameras that a camera may stand together with
 ALIKE = math.radians(30)  # between their viewing directions
@@ -45,7 +46,8 @@ def bounds_at(cameras: Sequence[Camera], centres: np.ndarray) -> np.ndarray:
     smoothly (Franke and Little's weights).
 
     Wider bounds would show what floats where no photo has looked: with the least near and the greatest far of all
-    cameras an orbit of the quick start's run shimmers by three tenths more, and is 0.4 dB farther from the truth.
+    frames an orbit of the quick start's run shimmers by a fifth more, and is 0.3 dB farther from the truth
+    (`benchmarks/film_bounds.py`).
     """
     lengths = np.log([(camera.near, camera.far) for camera in cameras])
     count = min(NEAREST + 1, len(cameras))
