@@ -16,6 +16,17 @@ Image.init()
 # Not EPS, for which Pillow would run a program.
 READ = ("JPEG", "PNG", "TIFF", "WEBP", "GIF", "BMP", "PPM", "JPEG2000", "AVIF")
 FORMATS = tuple(name for name in READ if name in Image.OPEN)
+ORIENTATION = 0x0112
+TURN_BACK = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+ACROSS = {Image.Transpose.TRANSPOSE, Image.Transpose.ROTATE_90, Image.Transpose.TRANSVERSE, Image.Transpose.ROTATE_270}
 KINDS = {"1": "grayscale", "L": "grayscale", "LA": "grayscale with alpha", "RGBA": "RGB with alpha", "P": "palette"}
 
 
@@ -29,9 +40,10 @@ def decode_photo(data: bytes, photo: ScenePhoto) -> np.ndarray:
     where = f"photo {photo.name}"
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-            if image.size != (photo.width, photo.height):
+            size = stored_size(image)
+            if size != (photo.width, photo.height):
                 raise ShardError(
-                    f"{where} has {image.width} x {image.height} pixels and its camera {photo.width} x "
+                    f"{where} has {size[0]} x {size[1]} pixels and its camera {photo.width} x "
                     f"{photo.height}: use the photos that the model was made from"
                 )
             return to_rgb(image, where)
@@ -91,7 +103,24 @@ def same_aspect(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 def to_rgb(image: Image.Image, where: str) -> np.ndarray:
-    """uint8 (h, w, 3) of any 8- or 16-bit picture; gray is repeated."""
+    """uint8 (h, w, 3) of any 8- or 16-bit picture, as it is stored; gray is repeated."""
+    turn = turn_back(image)
+    if turn is not None:
+        return np.asarray(Image.fromarray(_to_rgb(image, where)).transpose(turn))
+    return _to_rgb(image, where)
+
+
+def stored_size(image: Image.Image) -> tuple[int, int]:
+    """Width and height of the pixels in the file of an image that is not loaded yet."""
+    return image.size[::-1] if turn_back(image) in ACROSS else image.size
+
+
+def turn_back(image: Image.Image) -> Image.Transpose | None:
+    """What undoes the turn by EXIF orientation that Pillow does when it loads a TIFF, and only a TIFF."""
+    return TURN_BACK.get(image.tag_v2.get(ORIENTATION, 1)) if isinstance(image, TiffImageFile) else None
+
+
+def _to_rgb(image: Image.Image, where: str) -> np.ndarray:
     if image.mode.startswith("I;16"):
         return np.repeat(_to_8_bits(image)[..., None], 3, axis=2)
     if image.mode in ("I", "F"):

@@ -65,8 +65,8 @@ class View(NamedTuple):
 def view_rays(camera: Pinhole, pixel_center: float, device: torch.device, stride: int = 1) -> Rays:
     """A ray through every `stride`-th pixel of every `stride`-th row, in row order."""
     rows, cols = torch.meshgrid(
-        torch.arange(stride // 2, camera.height, stride, device=device),
-        torch.arange(stride // 2, camera.width, stride, device=device),
+        torch.arange(min(stride // 2, camera.height), camera.height, stride, device=device),
+        torch.arange(min(stride // 2, camera.width), camera.width, stride, device=device),
         indexing="ij",
     )
     intrinsics = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float32, device=device)

@@ -29,14 +29,15 @@ def job_of(run: Path) -> Job:
 
 
 def shards_of(job: Job, folder: Path) -> Path:
-    """The shards of the run in `folder`. Paths of a job are relative to where it was started: if there are no shards
-    as seen from here, they may be as seen from there, which the run's own path tells.
+    """The shards of the run in `folder`. Paths of a job are relative to where it was started, which the run's own path
+    tells; else they are as seen from here.
     """
     told = job.run.parts
-    if job.shards.is_absolute() or job.run.is_absolute() or job.shards.exists() or folder.parts[-len(told) :] != told:
+    if job.shards.is_absolute() or job.run.is_absolute() or folder.parts[-len(told) :] != told:
         return job.shards
-    seen_from_there = folder.parents[len(told) - 1] / job.shards
-    return seen_from_there if seen_from_there.exists() else job.shards
+    started = folder.parents[len(told) - 1]
+    elsewhere = started != resolved(Path()) and (started / job.shards).exists()
+    return started / job.shards if elsewhere else job.shards
 
 
 def checkpoint_of(run: Path, step: int | None = None) -> Checkpoint:

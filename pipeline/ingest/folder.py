@@ -19,14 +19,13 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from pipeline.errors import CrossrayError
 from pipeline.files import atomic_file
-from pipeline.pictures import FORMATS, conversion, reason, to_rgb
+from pipeline.pictures import FORMATS, ORIENTATION, TURN_BACK, conversion, reason, to_rgb
 
 Mapper = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 LEAST_SIDE = 64  # pixels: below, SIFT's largest scales do not fit and no camera is found
 LEAST_PHOTOS = 3
 AS_THEY_ARE = {"JPEG": ".jpg", "PNG": ".png"}
-ORIENTATION = 0x0112  # EXIF: 1 is upright, 2 to 8 are turned or mirrored
 HEIC = (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
 
 
@@ -160,7 +159,7 @@ def look(file: File) -> Seen:
 def upright(image: Image.Image) -> Image.Image:
     """The photo turned as its EXIF orientation says; the image itself where that says nothing, or nonsense."""
     try:
-        turned = image.getexif().get(ORIENTATION, 1) in range(2, 9)
+        turned = image.getexif().get(ORIENTATION) in TURN_BACK
         return ImageOps.exif_transpose(image) if turned else image
     except Exception:  # Pillow's EXIF reader raises whatever it meets; damaged pixels are told where they are read
         return image

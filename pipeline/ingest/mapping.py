@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,7 @@ TRIES: tuple[tuple[str, int, dict[str, bool]], ...] = (
     ("strict-fixed-distortion", 1, {"ba_refine_extra_params": False, "structure_less_registration_fallback": False}),
     ("seed-2", 2, {}),
 )
+Adjusted = Literal["all", "but distortion"]
 ENOUGH = 0.95  # share of the photos that can be registered: no further try
 FEW = 50  # photos: up to so many, a second try has to agree
 SHARED = 0.5  # share of its photos that a model must have in common with one that it is compared with
@@ -162,9 +163,10 @@ def run_try(database: str, photos: str, folder: str, index: int) -> None:
     pycolmap.set_random_seed(seed)
     found = pycolmap.incremental_mapping(database, photos, scratch, options)
     models = []
+    adjusted: Adjusted = "all" if settings.get("ba_refine_extra_params", True) else "but distortion"
     for number, reconstruction in sorted(found.items()):
         kept = scratch / f"model-{number}"
-        models.append(judge(reconstruction, kept.name, distortion=settings.get("ba_refine_extra_params", True)))
+        models.append(judge(reconstruction, kept.name, adjusted=adjusted))
         kept.mkdir()
         reconstruction.write_binary(kept)
         shutil.rmtree(scratch / str(number), ignore_errors=True)
@@ -174,11 +176,11 @@ def run_try(database: str, photos: str, folder: str, index: int) -> None:
     scratch.rename(folder)
 
 
-def judge(model: Any, folder: str, *, distortion: bool = True) -> Model:
+def judge(model: Any, folder: str, *, adjusted: Adjusted | None = "all") -> Model:
     """Take the cameras out of `model` (a `pycolmap.Reconstruction`) that cannot be, and say whether the rest can.
 
     Args:
-        distortion: whether the lenses' distortion is adjusted, too, once cameras are out.
+        adjusted: what bundle adjustment may change once cameras are out; None: nothing, poses and lenses are given.
     """
     before = [model.images[i].name for i in model.reg_image_ids()]
     bad: dict[str, str] = {}
@@ -189,8 +191,8 @@ def judge(model: Any, folder: str, *, distortion: bool = True) -> Model:
             model.deregister_frame(image.frame_id)
         if not found:
             break
-        if len(model.reg_image_ids()) >= LEAST_PHOTOS and model.points3D:
-            adjust(model, distortion)  # the bad ones had bent the others
+        if adjusted and len(model.reg_image_ids()) >= LEAST_PHOTOS and model.points3D:
+            adjust(model, adjusted)  # the bad ones had bent the others
     names = sorted(model.images[i].name for i in model.reg_image_ids())
     unsound = ""
     if len(bad) > MOST_BAD * len(before):
@@ -206,11 +208,11 @@ def judge(model: Any, folder: str, *, distortion: bool = True) -> Model:
     return Model(folder, names, len(model.points3D), error, bad, unsound)
 
 
-def adjust(model: Any, distortion: bool) -> None:
+def adjust(model: Any, what: Adjusted) -> None:
     """Bundle adjustment of all that is in `model`."""
     pycolmap = import_pycolmap()
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_extra_params = distortion
+    options.refine_extra_params = what == "all"
     pycolmap.bundle_adjustment(model, options)
 
 

@@ -60,7 +60,7 @@ class Summary:
     def agreement(self) -> str:
         """How well a second try agrees, in words."""
         if not self.apart:
-            return "not checked by a second try"
+            return "of one try alone"
         worst, most = max(self.apart.items(), key=lambda item: item[1])
         middle = median(self.apart.values())
         return f"two tries differ by {middle:.2f} degrees in the median, {most:.2f} at most ({self.registered[worst]})"

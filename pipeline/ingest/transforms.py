@@ -150,7 +150,7 @@ def triangulate(database: str, photos: str, out: str, poses: dict[str, np.ndarra
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
     done = pycolmap.triangulate_points(model, database, photos, scratch / "model-0", options=options)
-    verdict = judge(done, "model-0")
+    verdict = judge(done, "model-0", adjusted=None)
     (scratch / "model-0").mkdir(exist_ok=True)
     done.write_binary(scratch / "model-0")
     record = {"name": "triangulation", "models": [asdict(verdict)]}

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.manifest import CameraRecord
 from pipeline.views.camera import Camera, camera_of
+from pipeline.views.foreign import FAR_AWAY
 from pipeline.views.geometry import up_of
 from pipeline.views.smooth import bounds_at
 
@@ -57,7 +58,7 @@ class Place:
         """
         width, height = window
         numbers = np.concatenate([wxyz, position, [angle, np.linalg.norm(wxyz)]])
-        if min(window) < 1 or not np.isfinite(numbers).all() or numbers[-1] < 1e-9:
+        if min(window) < 1 or not (np.abs(numbers) <= FAR_AWAY).all() or numbers[-1] < 1e-9:
             return None
         scale = min(1.0, side / max(window))
         width, height = max(1, round(width * scale)), max(1, round(height * scale))

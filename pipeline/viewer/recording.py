@@ -23,7 +23,7 @@ from pipeline.pictures import FORMATS
 from pipeline.views.camera import Camera
 from pipeline.views.nerfstudio import write_camera_path
 from pipeline.views.path import FPS, CameraPath, Frame
-from pipeline.views.smooth import between, travel_times
+from pipeline.views.smooth import between, same_size, travel_times
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 MOST_KEYS = 200
@@ -77,8 +77,8 @@ def film_of(keys: Sequence[Key], seconds: float, names: dict[Light, str]) -> Cam
         moments, times, cameras = np.zeros(1), np.zeros(1), [keys[0].camera]
     else:
         frames = round(seconds * (len(keys) - 1) * FPS) + 1
-        cameras = between([key.camera for key in keys], frames)
-        times = travel_times([key.camera for key in keys])
+        stops = same_size([key.camera for key in keys])
+        cameras, times = between(stops, frames), travel_times(stops)
         share = np.arange(frames) / max(frames - 1, 1)
         moments = times[-1] * share * share * (3 - 2 * share)  # as the cameras ease in and out
     if not names:

@@ -35,7 +35,8 @@ DENSE = 512  # points in which a loop is laid out
 AWAY = 0.3  # from all cameras, of the distance to what the nearest one looks at: some 17 degrees
 LOST = 0.25  # share of a loop that may be away: of photos that surround a place, up to 45 degrees apart, less is
 TOGETHER = 0.45  # between two cameras that stand together, of the distance to what they look at: some 25 degrees
-LINKS = 16  # nearest cameras that a camera may stand together with
+SPOT = 0.02  # of the median distance: cameras within stand in one spot
+LINKS = 16  # nearest spots that a spot may be together with
 ALIKE = math.radians(30)  # between their viewing directions
 SMOOTHING = 0.02  # of a loop's length: sigma of the filter that rounds its corners
 
@@ -64,7 +65,8 @@ def orbit(cameras: Sequence[Camera], frames: int, size: tuple[int, int] | None =
     the largest group of cameras that stand `together`, in pictures that show no more than theirs do.
 
     The field of view across the shorter side follows that of the cameras around: a wide picture then shows no more
-    above and below than their photos do. Depth bounds are `bounds_at`. Memory: a few DENSE x len(cameras) float64.
+    above and below than their photos do. Depth bounds are `bounds_at`, or between those of a flight's stops. Memory: a
+    few DENSE x len(cameras) float64.
 
     Args:
         size: width and height of the pictures; by default 3:2, as high as the photos' shorter sides in the median.
@@ -83,7 +85,7 @@ def orbit(cameras: Sequence[Camera], frames: int, size: tuple[int, int] | None =
     focal = np.log([[math.sqrt(c.fx * c.fy) / min(c.width, c.height)] for c in cameras])
     rows = laid_out(np.hstack([poses[:, :, 3], targets, focal]), angles, route, is_closed, typical)
     if lost(rows[:, :3], poses, targets) > LOST and len(group := together(poses, targets)) > 1:
-        there = [cameras[i] for i in sorted(group, key=lambda i: angles[i])]
+        there = [cameras[group[k]] for k in unrolled(angles[group])]
         return there_and_back(there, frames, centred(cameras, size))
     share = np.arange(frames) / frames
     share = share if is_closed else (1 - np.cos(2 * np.pi * share)) / 2  # there and back, slow where it turns
@@ -114,8 +116,7 @@ def between(stops: Sequence[Camera], frames: int) -> list[Camera]:
     check_count(frames)
     if len(stops) < 2:
         raise CrossrayError(f"a flight needs two cameras at least, and has {len(stops)}")
-    first = stops[0]
-    stops = [first, *(resized(stop, first.width, first.height) for stop in stops[1:])]
+    first, *_ = stops = same_size(stops)
     poses = np.array([stop.pose for stop in stops])
     rotations = Rotation.from_matrix(poses[:, :, :3])
     lengths = np.log([(stop.fx, stop.fy, stop.near, stop.far) for stop in stops])
@@ -133,6 +134,12 @@ def between(stops: Sequence[Camera], frames: int) -> list[Camera]:
     cameras[-1:] = [stops[-1]]
     cameras[0] = first
     return cameras
+
+
+def same_size(stops: Sequence[Camera]) -> list[Camera]:
+    """The cameras in pictures of the first one's size."""
+    first = stops[0]
+    return [first, *(resized(stop, first.width, first.height) for stop in stops[1:])]
 
 
 # ---------------------------------------------------------------------------------------------------- parts of a loop
@@ -171,19 +178,29 @@ def lost(centres: np.ndarray, poses: np.ndarray, targets: np.ndarray) -> float:
 
 
 def together(poses: np.ndarray, targets: np.ndarray) -> list[int]:
-    """The largest group of cameras (N, 3, 4) that stand together, each with one other of it at least; of several of a
-    size the widest, which shows most.
+    """The largest group of spots in which cameras (N, 3, 4) stand together, each with another spot of it: a camera of
+    each. Of several of a size the widest, which shows most. One camera, where no two spots are together.
     """
-    centres, forwards = poses[:, :, 3], poses[:, :, 2]
-    depth = np.linalg.norm(targets - centres, axis=1)
-    apart, j = cKDTree(centres).query(centres, k=range(1, min(LINKS, len(poses)) + 1))
-    i = np.broadcast_to(np.arange(len(poses))[:, None], j.shape)
+    depth = np.linalg.norm(targets - poses[:, :, 3], axis=1)
+    cells = np.round(poses[:, :, 3] / (SPOT * np.median(depth)))
+    _, spots = np.unique(cells, axis=0, return_index=True)  # a burst, or a tripod, is one
+    centres, forwards, depth = poses[spots, :, 3], poses[spots, :, 2], depth[spots]
+    apart, j = cKDTree(centres).query(centres, k=range(1, min(LINKS, len(spots)) + 1))
+    i = np.broadcast_to(np.arange(len(spots))[:, None], j.shape)
     joined = apart <= TOGETHER * np.minimum(depth[i], depth[j])
     joined &= (forwards[i] * forwards[j]).sum(-1) > math.cos(ALIKE)
-    links = coo_matrix((np.ones(joined.sum()), (i[joined], j[joined])), shape=(len(poses), len(poses)))
+    links = coo_matrix((np.ones(joined.sum()), (i[joined], j[joined])), shape=(len(spots), len(spots)))
     _, label = connected_components(links, directed=False)
     groups = [np.flatnonzero(label == k) for k in range(label.max() + 1)]
-    return max(groups, key=lambda g: (len(g), float(np.ptp(centres[g], axis=0).max()))).tolist()
+    largest = max(groups, key=lambda g: (len(g), float(np.ptp(centres[g], axis=0).max())))
+    return spots[largest].tolist()
+
+
+def unrolled(angles: np.ndarray) -> np.ndarray:
+    """The order (N,) of angles from the far side of their widest gap, once round."""
+    order = np.argsort(angles)
+    gaps = np.diff(angles[order], append=angles[order[0]] + 2 * np.pi)
+    return np.roll(order, -gaps.argmax() - 1)
 
 
 def there_and_back(stops: Sequence[Camera], frames: int, lens: Camera) -> list[Camera]:
@@ -194,8 +211,8 @@ def there_and_back(stops: Sequence[Camera], frames: int, lens: Camera) -> list[C
     for stop in stops:
         f = max(stop.fx * lens.width / stop.width, stop.fy * lens.height / stop.height)
         cropped.append(posed(replace(lens, fx=f, fy=f, near=stop.near, far=stop.far), stop.pose))
-    there = between(cropped, frames // 2 + 1)
-    return [*there, *there[-2::-1]][:frames]
+    there = between(cropped, frames + 1)
+    return [there[frames - abs(frames - 2 * k)] for k in range(frames)]
 
 
 def angle_route(angles: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -137,3 +137,21 @@ def test_a_photo_with_damaged_exif_is_a_photo(tmp_path):
     Image.new("RGB", (80, 70), "red").save(tmp_path / "a.jpg", exif=b"Exif\x00\x00garbage")
     seen = look(File(tmp_path / "a.jpg", "a.jpg", tmp_path / "out"))
     assert (seen.reason, seen.size) == ("", (80, 70))
+
+
+@pytest.mark.parametrize("kind", ["TIFF", "JPEG", "PNG", "WEBP"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_each_orientation_of_each_format(tmp_path, kind, orientation):
+    stored = np.zeros((70, 80, 3), np.uint8)
+    stored[:35, :40], stored[:35, 40:], stored[35:, :40] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+    turns = [stored, stored[:, ::-1], stored[::-1, ::-1], stored[::-1], stored.swapaxes(0, 1), np.rot90(stored, -1),
+             np.rot90(stored, 2).swapaxes(0, 1), np.rot90(stored)]  # fmt: skip
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    options = {"WEBP": {"lossless": True}, "JPEG": {"quality": 100, "subsampling": 0}}.get(kind, {})
+    Image.fromarray(stored).save(tmp_path / "a", kind, exif=exif, **options)
+    for upright, wanted in ((True, turns[orientation - 1]), (False, stored)):
+        seen = look(File(tmp_path / "a", "a", tmp_path / f"out{upright}", upright))
+        assert seen.size == wanted.shape[1::-1]
+        with Image.open(tmp_path / seen.photo) as image:
+            np.testing.assert_allclose(np.asarray(image).astype(int), wanted, atol=3)

@@ -94,6 +94,19 @@ def test_the_rest_is_adjusted_once_a_bad_camera_is_out(tmp_path):
     assert not np.array_equal(wrong.cam_from_world().matrix(), truth)  # its world may have moved with it
 
 
+def test_given_poses_and_lenses_stay_when_a_bad_camera_is_out(tmp_path):
+    model = model_of(tmp_path)
+    model.cameras[102].params = [1e6 * 48, 1e6 * 48, 24, 18]
+
+    def given():
+        images = [i for i in model.images.values() if i.name != "photo_002.jpg"]
+        return np.concatenate([np.append(i.cam_from_world().matrix(), i.camera.params) for i in images])
+
+    before = given()
+    assert list(judge(model, "m", adjusted=None).bad) == ["photo_002.jpg"]
+    np.testing.assert_array_equal(given(), before)
+
+
 def test_differences_are_those_of_the_cameras_and_not_of_the_worlds(tmp_path):
     pycolmap = import_pycolmap()
     model = model_of(tmp_path)
@@ -178,7 +191,7 @@ def test_tries_that_never_agree_are_used_and_told(tmp_path, fake_run):
     exact = replace(summary, apart=dict.fromkeys(PHOTOS, 0.1))
     assert exact.inexact == ""
     assert exact.agreement() == "two tries differ by 0.10 degrees in the median, 0.10 at most (0.jpg)"
-    assert replace(summary, apart={}).agreement() == "not checked by a second try"
+    assert replace(summary, apart={}).agreement() == "of one try alone"
 
 
 def test_the_largest_of_the_sound_ones_else_all_tries_are_told(tmp_path, fake_run):

@@ -428,10 +428,10 @@ def test_shards_are_found_from_another_folder_than_the_one_where_a_run_was_start
     assert job_of(Path("out/runs/a")).shards == Path("out/shards")
     monkeypatch.chdir(elsewhere)
     assert job_of(Path("../start/out/runs/a")).shards.resolve() == start / "out" / "shards"
+    (elsewhere / "out" / "shards").mkdir(parents=True)  # another project's
+    assert job_of(run).shards.resolve() == start / "out" / "shards"
     (start / "out" / "shards").rmdir()
-    assert job_of(run).shards == Path("out/shards")  # nowhere: named as in the job
-    (elsewhere / "out" / "shards").mkdir(parents=True)
-    assert job_of(run).shards == Path("out/shards")
+    assert job_of(run).shards == Path("out/shards")  # as seen from here
     run.rename(elsewhere / "a")
     assert job_of(elsewhere / "a").shards == Path("out/shards")
 

@@ -206,6 +206,9 @@ def test_strides_keep_to_the_budget():
     assert stride_for([(18, 24)], 431) == (2, 9 * 12)
     assert stride_for([(18, 24), (24, 18)], 97) == (3, 2 * 6 * 8)
     assert stride_for([(18, 24)], 1)[1] <= 1
+    small = camera_at(np.zeros(3)).model_copy(update={"width": 6, "height": 4})
+    stride, rays = stride_for([(18, 24), (4, 6)], 1)
+    assert [len(view_rays(c, 0.5, CPU, stride).near) for c in (camera_at(np.zeros(3)), small)] == [rays, 0] == [1, 0]
     for budget in (1, 5, 50, 300):
         stride, rays = stride_for([(18, 24)], budget)
         assert rays == len(view_rays(camera_at(np.zeros(3)), 0.5, CPU, stride).near) <= budget

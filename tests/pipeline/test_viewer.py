@@ -340,6 +340,7 @@ def test_the_camera_of_a_window(trained):
         (w, np.zeros(3), np.nan, (120, 80)),
     ):
         assert place.camera(*wrong, 300) is None
+    assert place.camera(w, np.array([1e155, 0, 0]), 1.0, (120, 80), 300) is None
     for angle in (-3.0, 0.0, 7.0):
         assert place.camera(w, np.zeros(3), angle, (120, 80), 300).fy > 0
 

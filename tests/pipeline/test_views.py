@@ -23,7 +23,7 @@ from pipeline.views.choose import Stills, read_path, readings, stops_of, views_o
 from pipeline.views.geometry import focus_of, looking, up_of, weighted_median
 from pipeline.views.nerfstudio import read_camera_path, write_camera_path
 from pipeline.views.path import CameraPath, Frame, path_of
-from pipeline.views.smooth import between, bounds_at, orbit, there_and_back, travel_times
+from pipeline.views.smooth import between, bounds_at, orbit, there_and_back, together, travel_times, unrolled
 from pipeline.views.trajectory import read_trajectory, write_trajectory
 
 UP = np.array([0.0, -1.0, 0.0])  # the world of these tests is like a level camera's: y down
@@ -365,6 +365,28 @@ def test_orbit_of_few_cameras_apart_is_a_flight_among_those_together():
     moved = jumps(frames)[0]
     assert max(moved[0], moved[19], moved[20]) < 0.3 * moved.max()  # slow where it turns
     assert {f.near for f in frames} == {LENS.near}  # none of the telephotos'
+
+
+def test_a_burst_is_one_stop():
+    """20 photos in each of three spots, and six alone: the flight passes the spots."""
+    spots = [camera_at(c, (0, 0, 0)) for c in ((4, 0, 0), (3.9, 0, 0.6), (3.7, 0, 1.1))]
+    alone = [camera_at((4 * math.cos(a), 0, 4 * math.sin(a)), (0, 0, 0)) for a in (1.3, 2.2, 3.1, 4.0, 4.9, 5.6)]
+    poses = poses_of([*(s for s in spots for _ in range(20)), *alone])
+    assert sorted(k // 20 for k in together(poses, np.zeros((66, 3)))) == [0, 1, 2]
+    assert len(together(poses_of(alone), np.zeros((6, 3)))) == 1
+
+
+def test_stops_follow_each_other_across_the_back():
+    angles = np.radians([178, -170, 160, -178, 170])
+    assert np.degrees(angles[unrolled(angles)]).round().tolist() == [160, 170, 178, -178, -170]
+    assert unrolled(np.array([0.3])).tolist() == [0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
+def test_there_and_back_is_a_loop_of_any_length(count):
+    x = poses_of(there_and_back([camera_at((i, 0, -4), (i, 0, 0)) for i in range(2)], count, LENS))[:, 0, 3]
+    share = np.array([1 - abs(1 - 2 * k / count) for k in range(count)])
+    np.testing.assert_allclose(x, share * share * (3 - 2 * share), atol=1e-9)
 
 
 def test_a_zoom_takes_its_time():
