@@ -86,8 +86,10 @@ STAGES = {
 }
 
 
-# `landmark` and `mask` hand their tasks to Ray as `shard` does; Ray's starts are most of what they take.
-EACH = [pytest.param(name, marks=pytest.mark.cluster if name in ("landmark", "mask") else ()) for name in STAGES]
+# `landmark` and `mask` hand their tasks to Ray as `shard` does; Ray's starts are most of what they take. `timing` takes
+# the longest by itself, and writes as the others do.
+WITH_CLUSTERS = ("landmark", "mask", "timing")
+EACH = [pytest.param(name, marks=pytest.mark.cluster if name in WITH_CLUSTERS else ()) for name in STAGES]
 
 
 @pytest.fixture(scope="module")
