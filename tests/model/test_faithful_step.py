@@ -90,7 +90,9 @@ def close(found: Tensor, expected: Tensor, name: str) -> None:
     assert error < TOLERANCE, f"{name}: off by {error:.1e} of its largest entry {scale:.1e}"
 
 
-@pytest.mark.parametrize(("count", "step"), [(1, 0), (2, 1500), pytest.param(2, 5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("count", "step"), [(1, 0), *(pytest.param(2, step, marks=pytest.mark.slow) for step in (1500, 5000))]
+)
 def test_every_term_and_every_gradient(count, step):
     """Before and after the mask's weight has reached its floor, at 2,120 steps; with one patch and with two."""
     model, patches = faithful_model(seed=step), random_patches(seed=step, count=count)

@@ -52,6 +52,7 @@ def test_gradients_reach_everything():
         assert parameter.grad.abs().sum() > 0, name
 
 
+@pytest.mark.slow
 def test_it_learns_a_mask_of_single_pixels():
     """Pixels enter and leave in groups of four; a mask may still differ from pixel to pixel."""
     torch.manual_seed(0)
