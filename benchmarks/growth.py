@@ -31,7 +31,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-import torch.distributed as dist
 from rich.console import Console
 from rich.table import Table
 
@@ -45,7 +44,7 @@ from pipeline.timing_job import TimingJob, make_timing, method_job, training_job
 from pipeline.timing_measure import Meter, Seconds, summarised
 from pipeline.timing_scene import synthetic_photos
 from pipeline.timing_training import Steps
-from pipeline.together import control_group
+from pipeline.together import Together
 from pipeline.work import Context
 
 METHOD = "crossray"
@@ -148,7 +147,7 @@ def as_rank(mapping: dict[str, Any], rounds: int) -> dict[str, list[float]]:
 
 def turns(timing: TimingJob, rounds: int, context: Context) -> dict[str, list[float]]:
     """The turns of a rank, alone, beside the other, and together with it."""
-    size, meter, group = recipe(timing), Meter(context.device, 0.0), control_group(context)
+    size, meter, together = recipe(timing), Meter(context.device, 0.0), Together(context)
     own, shared = (steps_of(timing, size, c) for c in (Context(device=context.device), context))
     idle = context.rank != 0
     kinds: dict[str, Callable[[], None]] = {
@@ -159,10 +158,8 @@ def turns(timing: TimingJob, rounds: int, context: Context) -> dict[str, list[fl
     times: dict[str, list[float]] = {kind: [] for kind in kinds}
     for _ in range(rounds):
         for kind, run in kinds.items():
-            dist.barrier(group)
-            seconds = torch.tensor(meter.once(run) / STEPS)
-            dist.all_reduce(seconds, dist.ReduceOp.MAX, group)
-            times[kind].append(float(seconds))
+            together.numbers()  # all are here
+            times[kind].append(float(together.numbers(meter.once(run) / STEPS).max()))
     return times
 
 

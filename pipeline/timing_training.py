@@ -14,6 +14,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+from pipeline.averaging import distribute, room
 from pipeline.batches import TrainingPhotos
 from pipeline.clock import Clock
 from pipeline.config import Job
@@ -24,12 +25,11 @@ from pipeline.timing import TimingRow
 from pipeline.timing_job import TimingJob, training_job, with_precision
 from pipeline.timing_measure import Meter, Seconds, counted_flops, memory_of
 from pipeline.timing_scene import synthetic_photos
-from pipeline.together import agree, control_group
+from pipeline.together import Together
 from pipeline.train import (
     LOOK_EVERY,
     build_model,
     build_optimiser,
-    distribute,
     forward,
     set_learning_rates,
     set_up_torch,
@@ -158,8 +158,8 @@ class Steps:
         self.work = Work(job, context, data, job.train.steps_per_epoch)
         self.model = build_model(job, photos, context.device)
         self.optimiser = build_optimiser(self.model, job.train)
-        self.ddp = distribute(self.model, context)
-        self.together = control_group(context)
+        self.together = Together(context, room(self.model, context))
+        self.ddp = distribute(self.model, context, self.together)
         self.record = LossRecord(record_path(job.run, context.rank), 0)
         self.clock = Clock(job.train.epochs * job.train.steps_per_epoch, None)
 
@@ -170,7 +170,7 @@ class Steps:
             set_learning_rates(self.optimiser, self.work.job.train, self.clock)
             training_step(self.work, self.ddp, self.optimiser, self.clock.step, self.record)
             self.clock.step += 1
-            agree(self.together, self.work.context, 0.0)
+            self.together.agree(False, 0.0)
         self.record.look()
 
     def flops(self) -> float:

@@ -1,5 +1,5 @@
-"""What the ranks of a run do together beside averaging gradients: agree on time and on stopping, find a step with
-numbers that are not finite, and save."""
+"""What the ranks of a run do together: tell each other numbers, agree on time and on stopping, find a step with numbers
+that are not finite, and save."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from filelock import Timeout
+from torch import Tensor
 
 from model.scene_model import SceneModel
 from pipeline.best import best_steps, lock_of_best
@@ -19,39 +20,65 @@ from pipeline.checkpoint import committed, prune, save_checkpoint
 from pipeline.clock import Speed
 from pipeline.record import GRADIENT, LossRecord
 from pipeline.resume import TrainingError, check_run_folder, checkpoints
+from pipeline.shared_memory import SharedMemory, share_memory
 from pipeline.work import Context, Work
 
 log = logging.getLogger("crossray")
 
-
-def control_group(context: Context) -> dist.ProcessGroup | None:
-    """Where the ranks agree on small things without waiting for their GPUs; None: the default group."""
-    return dist.new_group(backend="gloo") if context.world_size > 1 and context.device.type == "cuda" else None
+ROOM = 4096  # bytes: enough for whatever numbers are told
 
 
-def agree(together: dist.ProcessGroup | None, context: Context, seconds: float) -> tuple[bool, float]:
-    """All ranks take rank 0's clock, and stop if any of them was asked to."""
-    if context.world_size == 1:
-        return context.should_stop(), seconds
-    shared = torch.tensor([float(context.should_stop()), seconds if context.rank == 0 else 0.0], dtype=torch.float64)
-    dist.all_reduce(shared, group=together)
-    return bool(shared[0] > 0), float(shared[1])
+class Together:
+    """All ranks of a run, who tell each other tensors: through memory where they share a machine, else over gloo, also
+    beside GPUs, which nobody waits for here.
 
+    All ranks make this at once, and make the same calls in the same order.
 
-def same_step(together: dist.ProcessGroup | None, context: Context, step: int) -> None:
-    """RuntimeError where ranks go on from other steps, as when a disk shows one of them less than the others; an error
-    of this kind is one after which a launcher may try again."""
-    if context.world_size == 1:
-        return
-    ends = torch.tensor([step, -step])
-    dist.all_reduce(ends, dist.ReduceOp.MIN, group=together)
-    if ends[0] != -ends[1]:
-        raise RuntimeError(f"ranks go on from steps {int(ends[0])} to {-int(ends[1])}: they see other checkpoints")
+    Args:
+        room: bytes of the largest tensor.
+    """
+
+    def __init__(self, context: Context, room: int = 0) -> None:
+        self.alone = context.world_size == 1
+        self.group: dist.ProcessGroup | None = None  # the default one
+        self.memory: SharedMemory | None = None
+        if not self.alone:
+            if context.device.type == "cuda":
+                self.group = dist.new_group(backend="gloo")
+            self.memory = share_memory(max(room, ROOM), self.group)
+
+    def gather(self, mine: Tensor) -> list[Tensor]:
+        """Every rank's tensor, by rank, of one shape and type; to be read before the next call."""
+        if self.alone:
+            return [mine]
+        if self.memory is not None:
+            return self.memory.exchange(mine)
+        theirs = [torch.empty_like(mine) for _ in range(dist.get_world_size())]
+        dist.all_gather(theirs, mine, group=self.group)
+        return theirs
+
+    def numbers(self, *mine: float) -> Tensor:
+        """Every rank's numbers (ranks, n), float64."""
+        return torch.stack(self.gather(torch.tensor(mine, dtype=torch.float64)))
+
+    def agree(self, stop: bool, seconds: float) -> tuple[bool, float]:
+        """All ranks take rank 0's clock, and stop if any of them was asked to."""
+        said = self.numbers(stop, seconds)
+        return bool(said[:, 0].any()), float(said[0, 1])
+
+    def same_step(self, step: int) -> None:
+        """RuntimeError where ranks go on from other steps, as when a disk shows one of them less than the others; an
+        error of this kind is one after which a launcher may try again."""
+        steps = self.numbers(step)
+        if steps.min() != steps.max():
+            raise RuntimeError(
+                f"ranks go on from steps {int(steps.min())} to {int(steps.max())}: they see other checkpoints"
+            )
 
 
 def save(
     work: Work,
-    together: dist.ProcessGroup | None,
+    together: Together,
     record: LossRecord,
     speed: Speed,
     model: SceneModel,
@@ -68,11 +95,8 @@ def save(
     folder = checkpoints(job)
     problem = attempt(lambda: check_run_folder(job)) if work.context.rank == 0 else None
     problem = problem or attempt(record.save)
-    if work.context.world_size > 1:
-        failed = torch.tensor([float(problem is not None)])
-        dist.all_reduce(failed, group=together)
-        if failed[0] and problem is None:
-            problem = OSError("the losses of another rank cannot be written")
+    if together.numbers(problem is not None).any() and problem is None:
+        problem = OSError("the losses of another rank cannot be written")
     if work.context.rank == 0:
         state = model.state_dict(), optimiser.state_dict()
         problem = problem or attempt(lambda: save_checkpoint(folder, step, *state, meta))
@@ -98,23 +122,18 @@ def attempt(action: Callable[[], object]) -> OSError | None:
     return None
 
 
-def check_finite(
-    work: Work, together: dist.ProcessGroup | None, record: LossRecord, model: SceneModel | None = None
-) -> None:
+def check_finite(work: Work, together: Together, record: LossRecord, model: SceneModel | None = None) -> None:
     """Stop before numbers that are not finite reach a checkpoint; all ranks stop with the same words.
 
     Args:
         model: its weights are looked at, too.
     """
-    bad, context = record.look(), work.context
-    found = torch.zeros(context.world_size, 2, dtype=torch.float64)  # a row a rank: step, which numbers as bits
+    bad = record.look()
     wrong = sum(1 << record.names.index(name) for name in bad.names) if bad else 0
-    found[context.rank] = torch.tensor([bad.step if bad else torch.inf, wrong])
-    if context.world_size > 1:
-        dist.all_reduce(found, group=together)
+    found = together.numbers(bad.step if bad else torch.inf, wrong)  # a row a rank: step, which numbers as bits
     step = float(found[:, 0].min())
     if step < torch.inf:
-        bits = [(rank, int(found[rank, 1])) for rank in range(context.world_size) if found[rank, 0] == step]
+        bits = [(rank, int(row[1])) for rank, row in enumerate(found) if row[0] == step]
         of_losses = (1 << record.names.index(GRADIENT)) - 1  # the gradient is the last, and that of all ranks
         ranks = [rank for rank, wrong in bits if wrong & of_losses] or [rank for rank, _ in bits]
         names = [n for i, n in enumerate(record.names[:-1]) if any(wrong >> i & 1 for _, wrong in bits)]

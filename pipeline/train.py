@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.parallel import DistributedDataParallel
 from torch.nn.utils import get_total_norm
 
 from model.methods import smallest_reference
 from model.scene_model import SceneModel
+from pipeline.averaging import distribute, room
 from pipeline.batches import TrainingPhotos, check_references
 from pipeline.board import Board, write_pictures, write_scalars
 from pipeline.clock import Clock, Speed
@@ -33,7 +33,7 @@ from pipeline.progress import Progress
 from pipeline.provenance import device_name
 from pipeline.record import GRADIENT, LossRecord, record_path
 from pipeline.resume import own_run, resume, run_identity
-from pipeline.together import agree, broken_step, check_finite, control_group, same_step, save
+from pipeline.together import Together, broken_step, check_finite, save
 from pipeline.work import Context, Work
 
 LOOK_EVERY = 10  # steps between the moments at which losses are read from the device
@@ -65,12 +65,12 @@ def train_owned(job: Job, context: Context) -> dict[str, Any]:
     seconds = job.train.seconds
     clock = Clock(None if seconds else job.train.epochs * work.steps_per_epoch, seconds)
     identity = run_identity(job, photos, work.steps_per_epoch)
-    ddp = distribute(model, context)
-    together = control_group(context)
-    if context.world_size > 2:
+    together = Together(context, room(model, context))
+    ddp = distribute(model, context, together)
+    if context.world_size > 2 and context.device.type == "cuda":
         warm_up(work, ddp)
     skipped = set(resume(job, identity, model, optimiser, clock, context.world_size))
-    same_step(together, context, clock.step)
+    together.same_step(clock.step)
 
     lead = context.rank == 0
     record = LossRecord(record_path(job.run, context.rank), clock.step)
@@ -89,7 +89,7 @@ def train_owned(job: Job, context: Context) -> dict[str, Any]:
             set_learning_rates(optimiser, job.train, clock)
             terms, watched = training_step(work, ddp, optimiser, clock.step, record)
         clock.step += 1
-        stopped, clock.seconds = agree(together, context, speed.seconds())
+        stopped, clock.seconds = together.agree(context.should_stop(), speed.seconds())
 
         ends = clock.done or stopped
         save_now = ends or clock.step % job.train.checkpoint_every == 0
@@ -199,19 +199,11 @@ def build_optimiser(model: SceneModel, train_job: TrainJob) -> torch.optim.Optim
     return torch.optim.Adam(groups, betas=train_job.adam_betas, eps=train_job.adam_epsilon, fused=True)
 
 
-def distribute(model: SceneModel, context: Context) -> torch.nn.Module:
-    """DDP where there are several ranks; buffers follow rank 0's."""
-    if context.world_size == 1:
-        return model
-    devices = [context.device.index] if context.device.type == "cuda" else None
-    return DistributedDataParallel(model, device_ids=devices)
-
-
 def warm_up(work: Work, ddp: torch.nn.Module) -> None:
     """Two backward passes whose gradients are dropped.
 
-    DDP orders its buckets anew after the first one, and with more than two ranks the order of a sum changes its last
-    bits: a resumed run must start with the order that an undisturbed one has. Buffers are put back as they were.
+    DDP orders its buckets anew after the first one, and with more than two ranks nccl's sums depend on the order: a
+    resumed run must start with the one that an undisturbed run has. Buffers are put back as they were.
     """
     before = {name: buffer.clone() for name, buffer in ddp.named_buffers()}
     step = next(step for step in itertools.count() if step not in work.job.train.skip_steps)

@@ -136,7 +136,8 @@ class HashField(Field):
     def density_and_inner(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Density (...,) at points (..., 3), and (..., .): features without their activation, or the bottleneck."""
         raw = at_least_float32(self.trunk(self.grid(self.contract(x).flatten(0, -2)))).view(*x.shape[:-1], -1)
-        return self.density(raw[..., 0]), raw[..., 1:]
+        density, inner = raw.split([1, raw.shape[-1] - 1], dim=-1)
+        return self.density(density[..., 0]), inner
 
     def density(self, raw: Tensor) -> Tensor:
         """exp(raw + bias): unlike softplus it starts low and moves fast, so no fog is left between the cameras."""

@@ -1,12 +1,13 @@
-"""Multiresolution hash encoding in pure torch: any device, no extension.
+"""Multiresolution hash encoding: in torch on any device, and on a CPU compiled (`model.fields.hashgrid_cpu`).
 
-Notation: L levels, T table entries a level, F features an entry, N points in [0, 1]^3. A level whose grid fits into its
-table is stored densely; a finer one is hashed (Instant-NGP, Mueller et al. 2022, eq. 4).
+Notation: L levels, T table entries a level, F = 2 features an entry, N points in [0, 1]^3. A level whose grid fits into
+its table is stored densely; a finer one is hashed (Instant-NGP, Mueller et al. 2022, eq. 4).
 """
 
 from __future__ import annotations
 
 import math
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -14,6 +15,8 @@ from torch import Tensor, nn
 
 # 2_654_435_761 as the int32 with the same bits: only the low bits of a product enter the hash.
 PRIMES = (1, 2_654_435_761 - 2**32, 805_459_861)
+FEATURES = 2
+HAS_NUMBA = find_spec("numba") is not None
 
 
 class HashEncoding(nn.Module):
@@ -22,7 +25,6 @@ class HashEncoding(nn.Module):
     Args:
         levels: number of grids L.
         log2_entries: base-2 logarithm of T.
-        features: F.
         min_resolution, max_resolution: cells a side of the first and last grid, geometric in between.
     """
 
@@ -30,12 +32,10 @@ class HashEncoding(nn.Module):
     strides: Tensor
     offsets: Tensor
 
-    def __init__(
-        self, levels: int, log2_entries: int, min_resolution: int, max_resolution: int, features: int = 2
-    ) -> None:
+    def __init__(self, levels: int, log2_entries: int, min_resolution: int, max_resolution: int) -> None:
         super().__init__()
         self.entries = 2**log2_entries
-        self.out_channels = levels * features
+        self.out_channels = levels * FEATURES
         growth = (max_resolution / min_resolution) ** (1 / max(levels - 1, 1))
         resolutions = [math.floor(min_resolution * growth**level + 1e-6) for level in range(levels)]
         side = torch.tensor([r + 1 for r in resolutions])
@@ -46,10 +46,13 @@ class HashEncoding(nn.Module):
         self.register_buffer("resolutions", torch.tensor(resolutions, dtype=torch.float32), persistent=False)
         self.register_buffer("strides", strides.int(), persistent=False)  # (3, L)
         self.register_buffer("offsets", (torch.arange(levels) * self.entries).int(), persistent=False)
-        self.table = nn.Parameter(torch.empty(levels * self.entries, features).uniform_(-1e-4, 1e-4))
+        self.table = nn.Parameter(torch.empty(levels * self.entries, FEATURES).uniform_(-1e-4, 1e-4))
 
     def forward(self, x: Tensor) -> Tensor:
         """Features (N, L F) of points x (N, 3) in [0, 1]; no gradient flows to x."""
+        if HAS_NUMBA and x.device.type == "cpu" and x.dtype == self.table.dtype == torch.float32:
+            compiled: Tensor = _LookUp.apply(self.table, x.detach(), self.resolutions, self.strides, self.num_dense)
+            return compiled
         index, weight = self.corners(x.detach())
         out: Tensor = _GatherCorners.apply(self.table, index, weight, len(self.resolutions))
         return out
@@ -61,8 +64,9 @@ class HashEncoding(nn.Module):
         int32 throughout: on a CPU this arithmetic is much faster than with int64.
         """
         scaled = x.t().contiguous()[:, None, :] * self.resolutions[None, :, None]  # (3, L, N)
-        # A point at 1 belongs to the last cell: the next one would lie outside the grid.
-        low = torch.minimum(scaled, self.resolutions[None, :, None] - 1).int()
+        # A point at 1 belongs to the last cell: the next one would lie outside the grid. What is not a number has a
+        # cell, too, and a weight that is not a number: the loss will say so.
+        low = torch.minimum(torch.where(scaled > 0, scaled, 0), self.resolutions[None, :, None] - 1).int()
         fraction = scaled - low
         low_index = low * self.strides[:, :, None]
         index_at = (low_index, low_index + self.strides[:, :, None])
@@ -83,6 +87,26 @@ class HashEncoding(nn.Module):
                 torch.bitwise_xor(index_at[i][0, dense:], hash_yz, out=index[corner, dense:])
                 torch.mul(weight_at[i][0], weight_yz, out=weight[corner])
         return index.view(8, -1), weight.view(8, -1)
+
+
+class _LookUp(torch.autograd.Function):
+    """The compiled look-up; the backward pass finds the corners anew, which is cheaper than to keep them."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, x: Tensor, resolutions: Tensor, strides: Tensor, num_dense: int) -> Tensor:
+        from model.fields import hashgrid_cpu  # not where GPUs do the work
+
+        ctx.save_for_backward(x, resolutions, strides)
+        ctx.rows, ctx.num_dense = len(table), num_dense
+        return hashgrid_cpu.look_up(x, table, resolutions, strides, num_dense)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None, None]:
+        from model.fields import hashgrid_cpu
+
+        (grad,) = grad_outputs
+        x, resolutions, strides = ctx.saved_tensors
+        return hashgrid_cpu.gradient(x, grad, ctx.rows, resolutions, strides, ctx.num_dense), None, None, None, None
 
 
 class _GatherCorners(torch.autograd.Function):

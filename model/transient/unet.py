@@ -48,4 +48,8 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
 
 def resize(x: Tensor, like: Tensor) -> Tensor:
     """x at the height and width of `like`."""
-    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
+    resized = F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
+    if resized.requires_grad:
+        # A concatenation's gradient is a part of a larger tensor, with which torch's kernel is five times slower.
+        resized.register_hook(lambda grad: grad.contiguous(memory_format=torch.channels_last))
+    return resized

@@ -36,7 +36,7 @@ from pipeline.record import LossRecord, record_path
 from pipeline.render import check_reference, read_appearance, render_picture, render_view
 from pipeline.resume import run_identity
 from pipeline.scene import SceneError, camera_to_world, depth_bounds
-from pipeline.together import check_finite
+from pipeline.together import Together, check_finite
 from pipeline.train import (
     LOOK_EVERY,
     build_model,
@@ -174,7 +174,7 @@ class Crossray:
         """CrossrayError where the steps since the last look, or the weights of `model`, hold numbers that are not
         finite."""
         if self.work is not None:
-            check_finite(self.work, None, self.record, model)
+            check_finite(self.work, Together(self.work.context), self.record, model)
             self.record = LossRecord(self.record.path, self.step)  # what was looked at is not needed again
 
     def save(self, path: str) -> None:

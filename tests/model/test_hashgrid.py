@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from model.fields import hashgrid, hashgrid_cpu
 from model.fields.hashgrid import HashEncoding
 
 
@@ -40,6 +41,13 @@ def slow_lookup(table: Tensor, resolutions: list[int], entries: int, x: Tensor) 
     return torch.stack(rows)
 
 
+@pytest.fixture(autouse=True, params=["compiled", "torch"])
+def route(request, monkeypatch):
+    """Everything here holds for both routes of the look-up on a CPU."""
+    monkeypatch.setattr(hashgrid, "HAS_NUMBA", request.param == "compiled")
+    return request.param
+
+
 def encoding_with_random_table(**sizes) -> HashEncoding:
     encoding = HashEncoding(**sizes)
     torch.nn.init.normal_(encoding.table, generator=torch.Generator().manual_seed(0))
@@ -56,16 +64,13 @@ def test_resolutions_grow_geometrically_and_end_at_the_last():
     assert HashEncoding(1, 8, 4, 64).resolutions.tolist() == [4]
 
 
-@pytest.mark.parametrize("features", [1, 2, 3])
-def test_dense_and_hashed_levels_equal_the_slow_lookup(features):
+def test_dense_and_hashed_levels_equal_the_slow_lookup():
     # Sides 4, 7, 13, 25; 4^3 and 7^3 entries fit into 512.
-    encoding = encoding_with_random_table(
-        levels=4, log2_entries=9, min_resolution=3, max_resolution=24, features=features
-    )
+    encoding = encoding_with_random_table(levels=4, log2_entries=9, min_resolution=3, max_resolution=24)
     assert encoding.num_dense == 2
     x = random_points(40)
     expected = slow_lookup(encoding.table.detach(), [3, 6, 12, 24], 512, x)
-    assert encoding(x).shape == (40, encoding.out_channels) == (40, 4 * features)
+    assert encoding(x).shape == (40, encoding.out_channels) == (40, 8)
     torch.testing.assert_close(encoding(x).double(), expected, atol=2e-5, rtol=0)
 
 
@@ -160,3 +165,63 @@ def test_no_gradient_reaches_the_points():
 
 def test_buffers_stay_out_of_checkpoints():
     assert list(HashEncoding(2, 8, 3, 6).state_dict()) == ["table"]
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, -0.25, 1e30])
+def test_what_is_no_point_touches_nothing_outside_the_table(wrong):
+    """Weights that have run away give such points: the loss has to say so, not the operating system."""
+    encoding = encoding_with_random_table(levels=4, log2_entries=9, min_resolution=3, max_resolution=24)
+    x = random_points(3)
+    x[1, 2] = wrong
+    found = encoding(x)
+    right = encoding(x[[0, 2]])
+    assert torch.equal(found[[0, 2]], right)
+    assert found[1].isfinite().all() == math.isfinite(wrong)
+    found.sum().backward()
+    assert encoding.table.grad.shape == encoding.table.shape
+
+
+def test_both_routes_give_the_same_at_the_sizes_of_the_fast_field(monkeypatch):
+    encoding = encoding_with_random_table(levels=12, log2_entries=15, min_resolution=8, max_resolution=512)
+    x, cotangent = random_points(2000), torch.randn(2000, 24, generator=torch.Generator().manual_seed(2))
+    found = []
+    for compiled in (True, False):
+        monkeypatch.setattr(hashgrid, "HAS_NUMBA", compiled)
+        encoding.table.grad = None
+        out = encoding(x)
+        out.backward(cotangent)
+        found.append((out.detach(), encoding.table.grad))
+    torch.testing.assert_close(found[0], found[1], atol=1e-5, rtol=0)
+
+
+def test_doubles_take_torchs_route():
+    encoding = encoding_with_random_table(levels=4, log2_entries=9, min_resolution=3, max_resolution=24)
+    single, double = encoding(random_points(40)), encoding.double()(random_points(40).double())
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(single.double(), double, atol=1e-5, rtol=0)
+
+
+def test_threads_change_no_bit(monkeypatch):
+    encoding = encoding_with_random_table(levels=4, log2_entries=9, min_resolution=3, max_resolution=24)
+    x = random_points(1001)
+    alone = encoding(x)
+    monkeypatch.setattr(hashgrid_cpu, "POINTS_A_THREAD", 100)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert torch.equal(encoding(x), alone)
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("problem", [RuntimeError("no locator"), OSError(28, "No space left on device")])
+def test_without_a_folder_for_what_is_compiled_it_is_compiled_anew(monkeypatch, problem):
+    made = hashgrid_cpu.numba.njit
+
+    def njit(*arguments, cache=False, **options):
+        if cache:
+            raise problem
+        return made(*arguments, **options)
+
+    monkeypatch.setattr(hashgrid_cpu.numba, "njit", njit)
+    assert hashgrid_cpu.compiled("float32(float32)")(lambda x: x + x)(1.5) == 3

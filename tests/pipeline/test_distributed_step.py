@@ -8,8 +8,10 @@ import torch.distributed as dist
 from tiny_run import cut_tiny, tiny_job, tiny_photos
 
 from model.methods import METHODS
+from pipeline.averaging import distribute, room
 from pipeline.batches import TrainingPhotos
-from pipeline.train import build_model, distribute, forward
+from pipeline.together import Together
+from pipeline.train import build_model, forward
 from pipeline.work import Context, Work
 
 pytestmark = pytest.mark.slow
@@ -43,7 +45,8 @@ def test_every_method_takes_several_steps(cut, group, method, losses):
     photos = tiny_photos(cut)
     masks = job.model.transient == "fixed"
     data = TrainingPhotos(photos, CONTEXT.device, job.model.pixel_center, masks)
-    ddp = distribute(build_model(job, photos, CONTEXT.device), CONTEXT)
+    model = build_model(job, photos, CONTEXT.device)
+    ddp = distribute(model, CONTEXT, Together(CONTEXT, room(model, CONTEXT)))
     work = Work(job, CONTEXT, data, steps_per_epoch=6)
     for step in range(3):
         terms, _ = forward(work, ddp, step)
