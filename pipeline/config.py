@@ -296,7 +296,7 @@ def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "j
         check_weights(job.losses)
         check_training(job)
     except ValidationError as error:
-        raise JobError("\n".join(f"{source}: {explain(e)}" for e in error.errors())) from None
+        raise JobError("\n".join(f"{source}: {line}" for line in explained(error))) from None
     except ValueError as error:
         raise JobError(f"{source}: {error}") from None
     return job
@@ -426,6 +426,17 @@ def as_dict(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
+def explained(error: ValidationError, schema: type = Job) -> list[str]:
+    """What is wrong with a job file, a line a key: of a key that may be one of two things, what it is not."""
+    lines: dict[str, str] = {}
+    for one in error.errors():
+        key, _, reason = explain(one, schema).partition(": ")
+        if key in lines:
+            reason = f"{lines[key].rpartition(' (got ')[0]}, or {reason.removeprefix('input should be ')}"
+        lines[key] = reason
+    return [f"{key}: {reason}" if reason else key for key, reason in lines.items()]
+
+
 def explain(error: Any, schema: type = Job) -> str:
     """One pydantic error of a job file with this schema as `key: what is wrong, nearest right name`."""
     location = [str(part) for part in error["loc"]]
@@ -440,7 +451,8 @@ def explain(error: Any, schema: type = Job) -> str:
         return f"{key}: is missing"
     if key == "kind":
         return f"kind: {error['input']!r} is not known (valid: train, study, reeval, timing)"
-    return f"{key}: {error['msg'][:1].lower()}{error['msg'][1:]} (got {error['input']!r})"
+    reason = error["msg"].replace("valid tuple", "valid list")  # as YAML calls it
+    return f"{key}: {reason[:1].lower()}{reason[1:]} (got {error['input']!r})"
 
 
 def keys_at(location: list[str], schema: type = Job) -> list[str]:

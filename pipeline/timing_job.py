@@ -16,7 +16,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from model.methods import METHODS, smallest_reference
-from pipeline.config import Job, JobError, Section, explain, make_job, merge, nearest, parse_setting, parse_yaml
+from pipeline.config import Job, JobError, Section, explained, make_job, merge, nearest, parse_setting, parse_yaml
 
 Positive = Annotated[int, Field(ge=1)]
 Precision = Literal["float32", "bfloat16"]
@@ -125,7 +125,7 @@ def make_timing(raw: dict[str, Any], settings: Sequence[str] = (), source: str =
     try:
         timing = TimingJob.model_validate(raw)
     except ValidationError as error:
-        raise JobError("\n".join(f"{source}: {explain(e, TimingJob)}" for e in error.errors())) from None
+        raise JobError("\n".join(f"{source}: {line}" for line in explained(error, TimingJob))) from None
     try:
         check_timing(timing)
     except (ValueError, JobError) as error:

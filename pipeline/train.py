@@ -27,6 +27,7 @@ from pipeline.clock import Clock, Speed
 from pipeline.config import Job, TrainJob
 from pipeline.files import atomic_write
 from pipeline.heartbeat import Heartbeat, rank_path
+from pipeline.least_memory import check_memory
 from pipeline.patches import steps_per_epoch
 from pipeline.photos import Photos, open_photos
 from pipeline.progress import Progress
@@ -55,6 +56,7 @@ def train(job: Job, context: Context) -> dict[str, Any]:
 
 def train_owned(job: Job, context: Context) -> dict[str, Any]:
     """Like `train`, of a run that nobody else trains."""
+    check_memory(job, context.device)
     set_up_torch(job, context.device)
     photos = open_photos(job.shards)
     check_references(photos, smallest_reference(job.model))

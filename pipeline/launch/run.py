@@ -21,6 +21,7 @@ from pipeline.launch.local import run_local
 from pipeline.launch.reeval import each_checkpoint, evaluate_rest, evaluation_tasks
 from pipeline.launch.tasks import ray_session, ray_tasks
 from pipeline.launch.torchrun import pick_device, run_rank
+from pipeline.least_memory import check_memory
 from pipeline.manifest import MANIFEST, Manifest, read_manifest
 from pipeline.masks import read_record
 from pipeline.memory import give_back
@@ -54,7 +55,8 @@ def run_job(job: Job) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if launcher == "ray":
         return run_on_ray(job)
     if launcher == "local":
-        pick_device(job, job.ranks - 1)  # a job that wants more than there is says so before anything is started
+        # A job that wants more than there is says so before anything is started.
+        check_memory(job, pick_device(job, job.ranks - 1))
     ensure_shards(job)
     claim_run(job)
     if launcher == "torchrun":

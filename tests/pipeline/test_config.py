@@ -188,6 +188,16 @@ def test_several_mistakes_are_said_at_once():
     assert all(key in message for key in ("ranks:", "train.epochs:", "train.epoch:"))
 
 
+def test_a_key_that_may_be_one_of_two_things_has_one_line():
+    (line,) = refused({"train": {"steps_per_epoch": "foo"}}).splitlines()
+    assert "train.steps_per_epoch: input should be a valid integer" in line
+    assert line.endswith("or 'auto' (got 'foo')")
+
+
+def test_a_list_is_called_as_yaml_calls_it():
+    assert "evaluate.protocols: input should be a valid list (got 3)" in refused({"evaluate": {"protocols": 3}})
+
+
 def test_a_missing_scene_is_said():
     with pytest.raises(JobError, match=r"scene: is missing"):
         make_job({"name": "a"})
