@@ -2,7 +2,8 @@
 
 Torch needs some sixty calls for the same, each of which reads and writes arrays as long as all points; here a level's
 table stays in the cache, and nothing is stored between forward and backward. `model.fields.hashgrid` has the same in
-torch, for every other device and number; the tests hold the two against each other and against a slow third.
+torch, for every other device and number; the tests hold the two against each other and against a slow third. One
+thread does it: a second one beside torch's own gained nothing (benchmarks/results/speed.md).
 
 Notation as there. Points are float32 in [0, 1]^3. A coordinate that is not a number reads a valid entry, with a weight
 that is not a number: it reaches the loss, which says so, and no memory outside the table is touched.
@@ -11,15 +12,12 @@ that is not a number: it reaches the loss, which says so, and no memory outside 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba
 import numpy as np
-import torch
 from torch import Tensor
 
-POINTS_A_THREAD = 2**14  # fewer are looked up sooner than a thread is started
 ZERO, ONE = np.float32(0), np.float32(1)
 
 
@@ -27,14 +25,7 @@ def look_up(x: Tensor, table: Tensor, resolutions: Tensor, strides: Tensor, num_
     """Features (N, L F) of points x (N, 3): see HashEncoding. All float32 on a CPU; strides (3, L) are int32."""
     out = x.new_empty(len(x), len(resolutions) * table.shape[1])
     entries = table.detach().view(len(resolutions), -1, table.shape[1]).numpy()
-    grid, points, found = (resolutions.numpy(), strides.numpy(), num_dense), x.contiguous().numpy(), out.numpy()
-    threads = min(torch.get_num_threads(), len(x) // POINTS_A_THREAD)
-    if threads < 2:
-        _look_up(points, entries, *grid, found)
-        return out
-    parts = [slice(len(x) * i // threads, len(x) * (i + 1) // threads) for i in range(threads)]
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda part: _look_up(points[part], entries, *grid, found[part]), parts))
+    _look_up(x.contiguous().numpy(), entries, resolutions.numpy(), strides.numpy(), num_dense, out.numpy())
     return out
 
 

@@ -201,19 +201,6 @@ def test_doubles_take_torchs_route():
     torch.testing.assert_close(single.double(), double, atol=1e-5, rtol=0)
 
 
-def test_threads_change_no_bit(monkeypatch):
-    encoding = encoding_with_random_table(levels=4, log2_entries=9, min_resolution=3, max_resolution=24)
-    x = random_points(1001)
-    alone = encoding(x)
-    monkeypatch.setattr(hashgrid_cpu, "POINTS_A_THREAD", 100)
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-        assert torch.equal(encoding(x), alone)
-    finally:
-        torch.set_num_threads(before)
-
-
 @pytest.mark.parametrize("problem", [RuntimeError("no locator"), OSError(28, "No space left on device")])
 def test_without_a_folder_for_what_is_compiled_it_is_compiled_anew(monkeypatch, problem):
     made = hashgrid_cpu.numba.njit
