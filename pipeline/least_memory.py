@@ -14,15 +14,14 @@ HELD = 4  # floats a parameter: itself, its gradient, and Adam's two averages
 
 def check_memory(job: Job, device: torch.device) -> None:
     """CrossrayError where one rank's step cannot fit into the memory of its device."""
-    step, tables = step_bytes(job), table_bytes(job)
-    room = memory_of(device)
-    if step + tables <= room:
+    least, room = step_bytes(job) + table_bytes(job), memory_of(device)
+    if least <= room:
         return
-    rays = f"{job.patch.photos} patches of {job.patch.size} x {job.patch.size} rays"
-    keys = "patch.size, patch.photos, or the sizes in model." + job.model.field
+    owner = "the GPU" if device.type == "cuda" else "this machine"
     raise CrossrayError(
-        f"a step of {rays} holds at least {step / 2**30:,.0f} GiB, and its hash tables {tables / 2**30:,.0f}; "
-        f"{'the GPU' if device.type == 'cuda' else 'this machine'} has {room / 2**30:,.0f}. Make smaller: {keys}"
+        f"a step of {job.patch.photos} patches of {job.patch.size} x {job.patch.size} rays holds at least "
+        f"{least / 2**30:,.0f} GiB, and {owner} has {room / 2**30:,.0f}; make patch.size, patch.photos or the sizes in "
+        f"model.{job.model.field} smaller"
     )
 
 

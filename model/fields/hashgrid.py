@@ -16,7 +16,7 @@ from torch import Tensor, nn
 # 2_654_435_761 as the int32 with the same bits: only the low bits of a product enter the hash.
 PRIMES = (1, 2_654_435_761 - 2**32, 805_459_861)
 FEATURES = 2
-HAS_NUMBA = find_spec("numba") is not None
+HAS_NUMBA = find_spec("numba") is not None  # a machine with a GPU may lack it
 
 
 class HashEncoding(nn.Module):

@@ -57,7 +57,7 @@ def test_the_estimate_is_a_lower_bound(tmp_path):
 def test_a_job_that_fits_nowhere_says_what_to_make_smaller(tmp_path, monkeypatch, setting):
     monkeypatch.setattr(least_memory, "memory_of", lambda device: 2**21)
     job = job_of(tmp_path, setting, "model.hash.log2_entries=12")
-    with pytest.raises(CrossrayError, match=r"holds at least .* GiB.*Make smaller: patch.size, patch.photos, or"):
+    with pytest.raises(CrossrayError, match=r"holds at least .* GiB.*make patch\.size, patch\.photos or the sizes"):
         check_memory(job, CPU)
 
 
