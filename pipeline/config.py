@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from dataclasses import fields
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -292,6 +293,7 @@ def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "j
         raw = merge(raw, new_setting(raw, parse_setting(setting), source))
     try:
         job = Job.model_validate(with_defaults(raw))
+        check_switches(job, raw)
         check_spec(job.model)
         check_weights(job.losses)
         check_training(job)
@@ -300,6 +302,14 @@ def make_job(raw: dict[str, Any], settings: Sequence[str] = (), source: str = "j
     except ValueError as error:
         raise JobError(f"{source}: {error}") from None
     return job
+
+
+def check_switches(job: Job, raw: dict[str, Any]) -> None:
+    """ValueError for a true or false where a number is wanted: pydantic takes them for 1 and 0."""
+    for key, value in flatten(raw).items():
+        if isinstance(value, bool) and not isinstance(found := reduce(getattr, key.split("."), job), bool):
+            wanted = "a number" if isinstance(found, int | float) else "another value"
+            raise ValueError(f"{key}: {wanted} is wanted, not {str(value).lower()}")
 
 
 def check_training(job: Job) -> None:

@@ -194,6 +194,17 @@ def test_a_key_that_may_be_one_of_two_things_has_one_line():
     assert line.endswith("or 'auto' (got 'foo')")
 
 
+@pytest.mark.parametrize(
+    "key", ["ranks", "train.steps_per_epoch", "train.epochs", "model.hash.log2_entries", "patch.min_scale"]
+)
+def test_a_switch_is_no_number(key):
+    assert f"{key}: a number is wanted, not true" in refused(nested(key, True))
+
+
+def test_a_switch_stays_one():
+    assert job({"train": {"deterministic": True}}).train.deterministic
+
+
 def test_a_list_is_called_as_yaml_calls_it():
     assert "evaluate.protocols: input should be a valid list (got 3)" in refused({"evaluate": {"protocols": 3}})
 
