@@ -61,7 +61,7 @@ test-nerfbaselines: $(BASELINES)/.installed
 
 $(BASELINES)/.installed: pyproject.toml constraints.txt
 	test -x $(BASELINES)/bin/pip || $(PYTHON) -m venv $(BASELINES)
-	grep -vE '^(numpy|pandas)==' constraints.txt > $(BASELINES)/constraints.txt
+	grep -vE '^(numpy|pandas|plyfile)==' constraints.txt > $(BASELINES)/constraints.txt
 	$(BASELINES)/bin/python -m pip install --quiet --disable-pip-version-check \
 	    $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) --constraint $(BASELINES)/constraints.txt \
 	    --editable ".[nerfbaselines]" "pytest>=8.3" "hypothesis>=6.120"
