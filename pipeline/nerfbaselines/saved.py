@@ -131,8 +131,12 @@ def moments(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 def load_moments(optimiser: torch.optim.Optimizer, saved: dict[str, Tensor]) -> None:
     """Put back what `moments` gave."""
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in saved.items():
         number, _, name = key.partition(".")
+        parameter = parameters[int(number)].detach()
+        if value.shape == parameter.shape:  # safetensors keeps no strides, and the fused Adam wants the parameter's
+            value = torch.empty_like(parameter).copy_(value)
         state.setdefault(int(number), {})[name] = value
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
