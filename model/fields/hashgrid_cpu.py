@@ -53,13 +53,22 @@ def compiled(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any
 
 
 @numba.njit(inline="always")
-def cell(coordinate, resolution):
-    """Lower corner of the cell that a coordinate lies in, and the weight of the upper one."""
+def interval(coordinate, resolution):
+    """Lower end of the interval that a coordinate lies in, and the weight of the upper one."""
     scaled = coordinate * resolution
     low = scaled if scaled > ZERO else ZERO  # what is not a number has a cell, too
     last = resolution - ONE  # a point at 1 belongs to it: the next one would lie outside the grid
     low = np.uint32(np.int32(low if low < last else last))
     return low, scaled - np.float32(low)
+
+
+@numba.njit(inline="always")
+def cell(point, resolution):
+    """Lower corner of the cell that a point lies in, and how far in it the point is, an axis each."""
+    x, fx = interval(point[0], resolution)
+    y, fy = interval(point[1], resolution)
+    z, fz = interval(point[2], resolution)
+    return (x, y, z), (fx, fy, fz)
 
 
 @numba.njit(inline="always")
@@ -80,12 +89,10 @@ def _look_up(points, table, resolutions, strides, num_dense, out):
         entries, dense, resolution = table[level], level < num_dense, resolutions[level]
         steps = np.uint32(strides[1, level]), np.uint32(strides[2, level])
         for n in range(len(points)):
-            x, fx = cell(points[n, 0], resolution)
-            y, fy = cell(points[n, 1], resolution)
-            z, fz = cell(points[n, 2], resolution)
+            lows, fractions = cell(points[n], resolution)
             a, b = ZERO, ZERO
             for number in range(8):
-                row, weight = corner(number, (x, y, z), (fx, fy, fz), steps, mask, dense)
+                row, weight = corner(number, lows, fractions, steps, mask, dense)
                 a += weight * entries[row, 0]
                 b += weight * entries[row, 1]
             out[n, 2 * level], out[n, 2 * level + 1] = a, b
@@ -98,11 +105,9 @@ def _spread(points, grads, resolutions, strides, num_dense, table):
         entries, dense, resolution = table[level], level < num_dense, resolutions[level]
         steps = np.uint32(strides[1, level]), np.uint32(strides[2, level])
         for n in range(len(points)):
-            x, fx = cell(points[n, 0], resolution)
-            y, fy = cell(points[n, 1], resolution)
-            z, fz = cell(points[n, 2], resolution)
+            lows, fractions = cell(points[n], resolution)
             a, b = grads[n, 2 * level], grads[n, 2 * level + 1]
             for number in range(8):
-                row, weight = corner(number, (x, y, z), (fx, fy, fz), steps, mask, dense)
+                row, weight = corner(number, lows, fractions, steps, mask, dense)
                 entries[row, 0] += weight * a
                 entries[row, 1] += weight * b
